@@ -198,7 +198,7 @@ def test_a_stress_has_its_components_in_the_order_of_the_strain(coupling, coordi
     assert barostats.COMPONENTS == ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))
 
 
-def test_a_piston_has_the_period_that_was_asked_for():
+def test_a_piston_has_the_period_that_was_requested():
     """1/M of a mass M on the spring 1/(compressibility V): (2 pi/period)² compressibility V."""
     box = barostat_of(system_of(NPH | {"barostat_time_ps": 0.4}), 0)
     assert box.inverse_mass == pytest.approx((2 * pi / 0.4) ** 2 * 8e-5 / BAR * 14.0**3)

@@ -83,7 +83,7 @@ def test_charges_act_on_all_images_in_a_box_and_by_coulomb_without_one():
         ),
     ],
 )
-def test_keys_that_do_nothing_are_refused(edge, forces, message):
+def test_keys_without_an_effect_are_refused(edge, forces, message):
     with pytest.raises(SceneError, match=message):
         build(scene(edge, forces={"cutoff_A": 6.0} | forces))
 
@@ -198,7 +198,7 @@ def test_a_tail_correction_is_for_boxes_that_molecules_fill(lattice, edges, expe
         },
     ],
 )
-def test_no_tail_correction_beside_walls_and_frozen_molecules(tables):
+def test_no_tail_correction_next_to_walls_and_frozen_molecules(tables):
     system = build(scene(**tables))
     assert system.tail is None
     assert any("tail correction" in reason for reason in system.left_out)
@@ -315,7 +315,7 @@ def test_fine_ewald_sums_are_in_double_precision():
     assert "finer than single precision" in system.precision_reason
 
 
-def test_a_run_says_its_precision_and_energy_is_in_double(tmp_path):
+def test_a_run_states_its_precision_and_energy_is_in_double(tmp_path):
     simulation = Simulation(scene())
     summary = simulation.run().summary
     assert summary["precision"] == "mixed"
@@ -411,7 +411,7 @@ def test_check_warns_of_an_order_that_the_truncation_does_not_allow(
     assert ("forces jump to 0 at the cutoff" in printed("check", tmp_path / "s.toml").err) == warned
 
 
-def test_the_scene_of_a_run_has_no_keys_that_do_nothing(tmp_path):
+def test_the_scene_of_a_run_has_no_keys_without_an_effect(tmp_path):
     stages = [{"ensemble": "minimise", "most_iterations": 2}, NVT]
     ran = scene(stages=stages)
     Simulation(ran, folder=tmp_path / "run").run()
@@ -512,7 +512,7 @@ def test_a_default_step_without_a_temperature_is_two_femtoseconds():
     assert build(scene(**at_rest)).scene.stages[0].timestep_fs == 2
 
 
-def test_a_default_step_that_contradicts_another_key_is_told_with_its_length():
+def test_a_default_step_that_contradicts_another_key_is_reported_with_its_length():
     field = {
         "electric_V_per_nm": [0, 0, 0.1],
         "electric_frequency_per_ps": 150,
@@ -523,7 +523,7 @@ def test_a_default_step_that_contradicts_another_key_is_told_with_its_length():
     assert build(scene(fields=field, stages=stages)).scene.stages[0].timestep_fs == 3
 
 
-def test_a_run_keeps_its_default_step_and_check_tells_its_error(tmp_path, printed):
+def test_a_run_keeps_its_default_step_and_check_states_its_error(tmp_path, printed):
     path = tmp_path / "water.toml"
     path.write_text(
         "box.lengths_A = 13.0\nforces.cutoff_A = 6.0\n[[molecules]]\nmodel = 'spce'\ncount = 64\n"

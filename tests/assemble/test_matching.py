@@ -154,7 +154,7 @@ def test_sites_that_share_names(naming, order, ending, tmp_path):
 
 
 @pytest.mark.parametrize("named", ["A", "B"])
-def test_a_unique_name_decides_between_sites_that_look_alike(named, tmp_path):
+def test_a_unique_name_decides_between_sites_that_are_alike(named, tmp_path):
     """Whichever of the two ends of a symmetric molecule has the name of the charged end."""
     x = {"A": 1.16, "B": -1.16}
     sites = [
@@ -364,7 +364,7 @@ def test_names_that_fit_less_well_than_elements_are_noted(tmp_path):
     slant=st.booleans(),
     mirrored=st.booleans(),
 )
-def test_turned_shifted_wrapped_and_shuffled_atoms_are_the_same_molecules(
+def test_rotated_shifted_wrapped_and_shuffled_atoms_are_the_same_molecules(
     kinds, seed, slant, mirrored, tmp_path
 ):
     kinds = [
@@ -390,7 +390,7 @@ def test_turned_shifted_wrapped_and_shuffled_atoms_are_the_same_molecules(
         assert found.cell == pytest.approx(cell)
 
 
-def test_molecules_of_a_slanted_cell_are_made_whole(tmp_path):
+def test_molecules_of_a_triclinic_cell_are_made_whole(tmp_path):
     cell = [[12.0, 0, 0], [9.0, 11.0, 0], [-8.0, 7.0, 12.0]]
     truth = Truth(["spce"] * 8, 6, cell=cell)
     text = truth.xyz(truth.wrapped())
@@ -552,7 +552,7 @@ def test_molecules_longer_than_the_cell(cell, ending, shuffled, tmp_path):
 
 
 @pytest.mark.parametrize("elements", ["CC", "CCO"])
-def test_polymers_are_no_molecules(elements, tmp_path):
+def test_polymers_are_not_molecules(elements, tmp_path):
     """A chain of which the cell has one repeat unit, whose atoms fit a template."""
     kind = rod(*elements)
     cell = np.diag([1.3 * len(elements), 8.0, 9.0])

@@ -68,7 +68,7 @@ def test_the_memory_of_a_run_is_compared_before_it_is_used(monkeypatch, tmp_path
         build(scene)
 
 
-def test_a_body_with_more_samples_than_there_is_room_for(capsys, monkeypatch, tmp_path):
+def test_a_body_with_more_samples_than_there_is_memory_for(capsys, monkeypatch, tmp_path):
     monkeypatch.setattr(process, "free_memory", lambda: 8e9)
     text = SATELLITE.replace("timestep_s = 0.01", "timestep_s = 1e-8").replace(
         "interval_s = 0.1", "interval_s = 1e-8"
@@ -102,7 +102,7 @@ def test_a_body_with_more_samples_than_there_is_room_for(capsys, monkeypatch, tm
         ),
     ],
 )
-def test_molecules_with_more_samples_than_there_is_room_for(
+def test_molecules_with_more_samples_than_there_is_memory_for(
     changes, lines, gigabytes, capsys, monkeypatch, tmp_path
 ):
     monkeypatch.setattr(process, "free_memory", lambda: 8e9)
@@ -115,7 +115,7 @@ def test_molecules_with_more_samples_than_there_is_room_for(
     assert "lengthen output.log_interval_ps" in message
 
 
-def test_what_is_free_is_no_more_than_the_limits():
+def test_what_is_free_is_at_most_the_limits():
     assert 1e8 < process.free_memory() < 1e14
     code = (
         "import resource; resource.setrlimit(resource.RLIMIT_AS, (3 * 10**9, 3 * 10**9))\n"
@@ -128,7 +128,7 @@ def test_what_is_free_is_no_more_than_the_limits():
 @pytest.mark.parametrize(
     ("most", "square"), [((5, 6, 7), None), ((3, 0, 4), 20), ((0, 0, 3), None), ((0, 0, 0), None)]
 )
-def test_waves_in_columns_are_all_waves(most, square):
+def test_k_vectors_in_columns_are_all_k_vectors(most, square):
     found = vectors.k_vectors_up_to(most, square)
     axes = [np.arange(-m, m + 1) for m in most]
     n = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -112,12 +112,12 @@ def test_a_resolved_scene_has_every_number_and_resolves_to_itself(electrostatics
     assert rigidmd.resolve(again) == again
 
 
-def test_without_a_box_there_is_no_cut_off_to_decide():
+def test_without_a_box_there_is_no_cutoff_to_decide():
     resolved = rigidmd.resolve(small_scene({"spce": 3}, None))
     assert resolved.forces.cutoff_A is resolved.forces.switch_start_A is None
 
 
-def test_a_cell_that_leans_too_much_leaves_only_the_grid_open():
+def test_a_cell_that_tilts_too_much_leaves_only_the_grid_open():
     """The keys of a scene count along its own edges; the engine has others."""
     box = {"lengths_A": [24.0, 24.0, 24.0], "angles_deg": [60.0, 60.0, 45.0]}
     forces = {"electrostatics": "pme", "cutoff_A": 8.0}
@@ -134,7 +134,7 @@ def test_a_cell_that_leans_too_much_leaves_only_the_grid_open():
     assert (even.forces.pme_grid, even.forces.ewald_accuracy) == ((60, 60, 60), None)
 
 
-def test_faults_of_all_tables_are_said_at_once():
+def test_errors_of_all_tables_are_reported_at_once():
     molecules = [{"model": "spce", "count": 3, "frozen": "2-9"}]
     scene = small_scene(
         {}, 17.0, molecules=molecules, forces={"electrostatics": "pme", "ewald_alpha_per_A": 2.0}

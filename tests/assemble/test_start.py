@@ -9,7 +9,7 @@ from rigidmd.assemble.build import build
 from rigidmd.units import BOLTZMANN
 
 
-def test_walls_far_apart_or_close_together_leave_a_lattice(tmp_path):
+def test_walls_at_any_distance_leave_a_lattice(tmp_path):
     """Edges of the space for molecules may differ by any factor; all molecules lie between the
     walls."""
     for high in (1e-9, 1e-3, 30.0, 1e30):

@@ -267,7 +267,7 @@ def test_the_table_names_every_reference_file(reference):
     assert there == {case[0] for case in REFERENCE}
 
 
-def test_a_turned_cell_turns_velocities_too(tmp_path):
+def test_a_rotated_cell_rotates_velocities_too(tmp_path):
     truth = Truth(["spce", "nitrogen", "argon", "tip4p2005"], 3)
     species = [SPECIES[name] for name in ("nitrogen", "argon", "spce")]
     truth.species[3] = SPECIES["spce"]
@@ -289,7 +289,7 @@ def test_a_turned_cell_turns_velocities_too(tmp_path):
     assert lab == pytest.approx(true, abs=1e-4)
 
 
-def test_what_was_made_of_a_cell_is_said(tmp_path):
+def test_what_was_made_of_a_cell_is_reported(tmp_path):
     truth = Truth(["spce"] * 4, 5)
     text = xyz(truth.wrapped(), truth.cell * [[1], [1], [-1]])
     assert any("left-handed: -c replaces c" in note for note in read(tmp_path, text, "a.xyz").notes)
@@ -351,7 +351,7 @@ def test_a_state_is_not_taken_for_one_of_another_model_of_that_name(tmp_path):
         read_as("tip4p2005", "points.npz")
 
 
-def test_a_cell_with_room_for_a_cut_off_is_found(tmp_path):
+def test_a_cell_with_space_for_a_cutoff_is_found(tmp_path):
     """c of this cell stands 2 Å high, yet the lattice is that of a cube: rotated, the box is upright
     and has workspace."""
     cell = 14.0 * np.array([[1.0, 0, 0], [2.0, 1.0, 0], [7.0, 6.0, 1.0]]) @ standard_turn(3).T
@@ -650,7 +650,7 @@ def test_points_from_a_file_fit_wherever_they_are(tmp_path):
     assert len(build(Scene.from_dict(data, tmp_path)).state.position) == 64
 
 
-def test_structure_files_with_other_faults(capsys, tmp_path):
+def test_structure_files_with_other_errors(capsys, tmp_path):
     assert "count is 200" in refused(
         capsys, tmp_path, structure_scene(tmp_path, WATER216, extra="count = 200\n")
     )

@@ -130,7 +130,7 @@ def test_output_goes_to_runs_by_default(tmp_path, monkeypatch, capsys, printed):
     ],
 )
 @pytest.mark.parametrize("command", ["run", "check", "energy"])
-def test_a_file_that_is_no_scene_is_named(name, expected, command, printed, tmp_path):
+def test_a_file_that_is_not_a_scene_is_named(name, expected, command, printed, tmp_path):
     path = tmp_path / name
     match name:
         case "empty":
@@ -275,7 +275,7 @@ def test_times_of_averages_are_in_their_range(options, expected, printed, tmp_pa
     assert expected in printed("accuracy", scene, *options, code=2).err
 
 
-def test_the_help_tells_how_a_key_is_removed(capsys):
+def test_the_help_states_how_a_key_is_removed(capsys):
     with pytest.raises(SystemExit):
         main(["run", "--help"])
     assert "KEY= without a value removes the key" in " ".join(capsys.readouterr().out.split())

@@ -11,7 +11,7 @@ from rigidmd.run import Simulation
 from rigidmd.units import BAR, KJ_PER_MOL
 
 
-def test_what_energy_says_of_its_figures():
+def test_what_energy_states_of_its_figures():
     """The words of `rigidmd energy` next to the numbers that they are about."""
     forces = {"cutoff_A": 6.0, "electrostatics": "ewald", "tail_correction": True}
     for molecules, net in (([SALT[1]], 0.0), (SALT, 6.0)):
@@ -56,7 +56,7 @@ def test_what_energy_says_of_its_figures():
         ),
     ],
 )
-def test_what_energy_says_of_a_reaction_field(truncation, words, printed, tmp_path):
+def test_what_energy_states_of_a_reaction_field(truncation, words, printed, tmp_path):
     scene = tmp_path / "a.toml"
     scene.write_text(f"""
 [box]

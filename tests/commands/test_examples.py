@@ -74,7 +74,7 @@ def test_every_example_can_be_copied_and_read(path, tmp_path, monkeypatch, print
         assert file.read_bytes() == (path.parent / file).read_bytes()
 
 
-def test_a_copy_goes_where_it_is_asked_to_with_all_that_it_reads(tmp_path, printed):
+def test_a_copy_goes_where_it_is_requested_to_with_all_that_it_reads(tmp_path, printed):
     target = tmp_path / "deep" / "mine.toml"
     assert main(["new", "water_dimer", "-o", str(target)]) == 0
     assert (tmp_path / "deep" / "structures" / "water_dimer.xyz").is_file()
@@ -120,7 +120,7 @@ def test_the_name_of_a_series_is_its_first_scene(tmp_path, monkeypatch, printed)
         (["water", "-o", "file/mine.toml"], ["file/mine.toml cannot be written"]),
     ],
 )
-def test_what_cannot_be_copied_is_said(arguments, expected, tmp_path, monkeypatch, printed):
+def test_what_cannot_be_copied_is_reported(arguments, expected, tmp_path, monkeypatch, printed):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
     out, err = printed("new", *arguments, code=2)

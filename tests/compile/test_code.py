@@ -50,7 +50,7 @@ def test_a_second_process_compiles_the_last_tasks_first(tmp_path):
     assert done.stdout.split("\n")[0] == "[1, 1]", done.stderr
 
 
-def test_compiling_goes_on_alone_where_the_second_process_ends(tmp_path):
+def test_compiling_continues_alone_where_the_second_process_ends(tmp_path):
     lost = BOTH.replace("with code", "code.SECOND_PROGRAM = 'raise SystemExit'\nwith code").replace(
         "WAIT", "3"
     )

@@ -74,7 +74,7 @@ def llvm_of(dispatcher):
 
 
 @pytest.mark.usefixtures("empty_cache")
-def test_an_inner_kernel_has_no_wrapper_and_says_so():
+def test_an_inner_kernel_has_no_wrapper_and_states_it():
     @kernel
     def inner(x):
         return x + x
@@ -96,7 +96,7 @@ def test_an_inner_kernel_has_no_wrapper_and_says_so():
 
 @pytest.mark.usefixtures("empty_cache")
 @pytest.mark.parametrize("counted", [True, False])
-def test_references_are_not_counted_where_it_is_asked_for(counted):
+def test_references_are_not_counted_where_it_is_requested(counted):
     @kernel(from_python=True, count_references=counted)
     def after(values, count):
         part = values

@@ -47,7 +47,7 @@ def area(term):
         ("return LIMIT", "return 2 * LIMIT"),
     ],
 )
-def test_texts_layout_and_methods_are_no_part_of_a_definition(old, new):
+def test_texts_layout_and_methods_are_not_a_part_of_a_definition(old, new):
     assert TEXT.count(old) == 1
     assert read_source(TEXT.replace(old, new)) == read_source(TEXT)
 

@@ -106,7 +106,7 @@ def _take_alone(cells, job, address, room, blocks, own, threads):
         (1, 16, [0] * 6, [0, 5, 4, 3, 2, 1]),  # more than twice as many
     ],
 )
-def test_each_thread_begins_with_its_share_and_goes_on_with_what_is_left(
+def test_each_thread_begins_with_its_fraction_and_continues_with_what_is_left(
     own, threads, claimed, expected
 ):
     cells, order = np.zeros(FIRST_WORKER, np.int64), np.zeros(7, np.int64)
@@ -180,7 +180,7 @@ def test_simulations_on_all_threads_at_once_have_the_bits_of_each_alone():
         assert same_bits(a, b)
 
 
-def test_other_threads_read_energies_while_a_run_begins_and_goes_on():
+def test_other_threads_read_energies_while_a_run_begins_and_continues():
     """Two threads that use one engine at once end in a crash, or in another run."""
     stages = [{"ensemble": "nvt", "temperature_K": 90.0, "duration_ps": 4.0, "timestep_fs": 10.0}]
     scene = small_scene({"argon": 40}, 20.0, stages=stages, output={"log_interval_ps": 0.01})
@@ -206,7 +206,7 @@ def test_other_threads_read_energies_while_a_run_begins_and_goes_on():
     assert results.state.position.tobytes() == alone.state.position.tobytes()
 
 
-def test_other_threads_of_python_go_on_while_steps_are_taken():
+def test_other_threads_of_python_continue_while_steps_are_taken():
     [simulation] = short_runs(1)
     engine, state = simulation.engine, simulation.state.copy()
     row = SCHEMES["velocity_verlet"]
@@ -361,7 +361,7 @@ assert threading.active_count() == 1, threading.enumerate()
 """
 
 
-def test_one_thread_that_is_asked_for_has_no_helpers():
+def test_one_thread_that_is_requested_has_no_helpers():
     environment = os.environ | search_path(ROOT / "tests")
     done = subprocess.run(
         [sys.executable, "-c", ALONE], env=environment, capture_output=True, text=True
@@ -402,7 +402,7 @@ def test_benchmarks_measure_what_a_user_gets(monkeypatch):
     assert environment()["PATH"] == os.environ["PATH"]
 
 
-def test_check_says_how_many_threads_compute(capsys):
+def test_check_states_how_many_threads_compute(capsys):
     command = [sys.executable, "-m", "rigidmd", "check", "systems/water.toml", "--set", "threads=7"]
     environment = os.environ | {"NUMBA_NUM_THREADS": "2"}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)

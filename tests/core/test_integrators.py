@@ -277,7 +277,7 @@ def test_a_row_that_is_inconsistent_or_not_reversible_is_refused_when_it_is_made
         make()
 
 
-def test_rows_in_print_have_rounded_coefficients_and_shipped_ones_are_made_anew():
+def test_rows_in_print_have_rounded_coefficients_and_shipped_ones_are_made_again():
     rounded = split("mine", (0.1931833275, 0.613633345, 0.1931833275), (0.5, 0.5), 2, "in print")
     assert rounded.force_evaluations == 2
     for scheme in (SCHEMES | WITH_THERMOSTAT).values():

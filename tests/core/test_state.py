@@ -36,7 +36,7 @@ def test_a_state_comes_back_from_disk_to_the_bit(tmp_path):
 
 
 @pytest.mark.parametrize("steps", [(10, 7, 3), (20,)])
-def test_another_engine_goes_on_where_the_state_is(tmp_path, steps):
+def test_another_engine_continues_where_the_state_is(tmp_path, steps):
     """Time, heat and random numbers continue from the state alone; points, whose sums have one order,
     to the bit."""
     system, _, start = built({"argon": 2}, 30.0, 2)
@@ -68,7 +68,7 @@ def test_time_is_counted_from_where_steps_changed():
 
 @pytest.mark.parametrize("solver", ["rk4", "dop853"])
 @pytest.mark.parametrize("form", ["matrix", "quaternion", "euler_angles"])
-def test_a_solver_of_the_textbooks_equations_goes_on_from_its_state(solver, form):
+def test_a_solver_of_the_textbooks_equations_continues_from_its_state(solver, form):
     """What it evolves, the present step of DOP853 included, is in the state: a new engine gives the
     same bits."""
     scene = Scene.read(
@@ -116,7 +116,7 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_a_damaged_state_is_refused_in_words(tmp_path, damage):
+def test_a_damaged_state_is_refused_with_a_message(tmp_path, damage):
     system, _, state = built({"spce": 5}, 20.0, 1)
     write_state(tmp_path / "s.npz", system.saved(state))
     with np.load(tmp_path / "s.npz") as saved:

@@ -407,7 +407,7 @@ def test_forces_follow_the_cell_through_a_run():
         assert tallies[name].energy == pytest.approx(others[name].energy, rel=1e-11)
 
 
-def test_the_log_has_the_box_and_the_books(tmp_path):
+def test_the_log_has_the_box_and_the_energy_ledger(tmp_path):
     stages = [NPT | {"pressure_coupling": "flexible", "barostat_interval_ps": 0.004}]
     output = {
         "trajectory": "t.xtc",
@@ -476,7 +476,7 @@ def test_a_barostat_does_not_go_with_a_field_on_net_charges(coupled):
         build(scene)
 
 
-def test_a_box_that_becomes_too_small_or_boils_stops_in_words():
+def test_a_box_that_becomes_too_small_or_boils_stops_with_a_message():
     small = small_scene(
         {"argon": 40},
         20.0,
@@ -513,7 +513,7 @@ def test_a_box_that_becomes_too_small_or_boils_stops_in_words():
         Simulation(boils).run()
 
 
-def test_a_compressibility_in_another_unit_is_said():
+def test_a_compressibility_in_another_unit_is_reported():
     scene = small_scene({"argon": 20}, 30.0, stages=[NPT | {"compressibility_per_bar": 4.5e-10}])
     assert any("another unit" in note for note in build(scene).notes)
     assert not any(

@@ -118,7 +118,7 @@ def test_no_freedom_has_no_energy():
     assert chi_square(key_of(5, THERMOSTAT), 0, 0, 0, 0) == 0
 
 
-def test_streams_are_apart():
+def test_streams_are_separate():
     keys = {
         key_of(seed, purpose, stage)
         for seed in range(4)

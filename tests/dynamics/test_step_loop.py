@@ -73,7 +73,7 @@ def test_the_energy_error_is_of_order_two(liquid):
         pytest.param("srkn_6", 10, 0.3, marks=pytest.mark.soak),
     ],
 )
-def test_a_smooth_cut_off_leaves_every_scheme_its_order_in_the_liquid(liquid, name, steps, margin):
+def test_a_smooth_cutoff_leaves_every_scheme_its_order_in_the_liquid(liquid, name, steps, margin):
     """The median of 27 moments of the liquid. The forces have four derivatives: where a pair passes
     an end of the switch, srkn_6 is of a lower order, the more visibly the shorter its steps. So
     single moments differ (3.7 to 7), and the median of nine is off by more than 0.3 in one liquid

@@ -269,7 +269,7 @@ KINDS = ["pipe", "link to a pipe", "link to a device", "folder", "broken link", 
 @pytest.mark.parametrize(
     "name", ["summary.json", "log.csv", ANALYSIS, "rdf.csv", "scene.toml", "final.npz"]
 )
-def test_what_is_no_file_is_not_read(kind, name, argon, tmp_path):
+def test_what_is_not_a_file_is_not_read(kind, name, argon, tmp_path):
     folder = copied(argon, tmp_path)
     put(kind, folder / name, tmp_path)
     if name == "scene.toml":

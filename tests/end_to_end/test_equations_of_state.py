@@ -181,7 +181,7 @@ def test_a_crystal_has_the_same_edges_whichever_way_they_move(tmp_path):
 
 
 @pytest.mark.soak
-def test_a_crystal_gives_way_to_a_shear_as_its_elastic_constant_says(tmp_path):
+def test_a_crystal_gives_way_to_a_shear_as_its_elastic_constant_states(tmp_path):
     """Under a pressure xy the cell tilts the other way, by P_xy/C; C from the stress of a cell that
     is held sheared, and from how an unstressed cell fluctuates."""
 

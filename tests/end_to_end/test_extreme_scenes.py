@@ -393,7 +393,7 @@ scenes = st.fixed_dictionaries(
 @pytest.mark.soak
 @FEWER
 @given(scenes)
-def test_any_small_scene_runs_ten_steps_or_is_refused_in_words(data):
+def test_any_small_scene_runs_ten_steps_or_is_refused_with_a_message(data):
     runs_or_is_refused(data)
 
 
@@ -409,7 +409,7 @@ ONE_KIND = scenes.map(
 
 @FEWER
 @given(ONE_KIND)
-def test_any_small_scene_of_one_kind_runs_ten_steps_or_is_refused_in_words(data):
+def test_any_small_scene_of_one_kind_runs_ten_steps_or_is_refused_with_a_message(data):
     """As above, of scenes that compile to the same code."""
     runs_or_is_refused(data)
 

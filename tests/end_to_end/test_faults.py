@@ -210,7 +210,7 @@ SIGNALS = [signal.SIGTERM, signal.SIGINT]
 
 @pytest.mark.soak
 @pytest.mark.parametrize("sent", SIGNALS, ids=lambda sent: sent.name)
-def test_a_run_that_is_stopped_by_signals_goes_on(sent, scene, tmp_path):
+def test_a_run_that_is_stopped_by_signals_continues(sent, scene, tmp_path):
     """At 25 random moments each, preparing included."""
     rng = np.random.default_rng(int(sent))
     for _ in range(25):
@@ -380,7 +380,7 @@ def drive(*arguments: str) -> int:
 
 
 @LINUX
-def test_runs_survive_mixed_faults():
+def test_runs_survive_mixed_errors():
     """The first cases of a fixed series."""
     assert drive("--first", "1", "--cases", "4") == 4
 
@@ -388,6 +388,6 @@ def test_runs_survive_mixed_faults():
 @LINUX
 @pytest.mark.soak
 @pytest.mark.parametrize("series", [[], ["--wide"]], ids=["narrow", "wide"])
-def test_runs_survive_mixed_faults_for_an_hour(series):
+def test_runs_survive_mixed_errors_for_an_hour(series):
     """Another series each time; the message of a failure has the line that replays it."""
     assert drive("--minutes", "60", *series) > 100

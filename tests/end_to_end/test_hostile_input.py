@@ -184,7 +184,7 @@ def test_an_option_that_was_made_to_break(override, expected, capsys, tmp_path):
 
 
 @pytest.mark.parametrize("what", ["keys", "tables", "molecules"])
-def test_twenty_thousand_faults_are_told_at_once(what, capsys, tmp_path):
+def test_twenty_thousand_errors_are_reported_at_once(what, capsys, tmp_path):
     some = {
         "keys": "".join(f"k{n} = 1\n" for n in range(20_000)) + GOOD,
         "tables": GOOD + "".join(f"[k{n}]\n" for n in range(20_000)),

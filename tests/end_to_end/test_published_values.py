@@ -41,7 +41,7 @@ def near(value, published, slack=0.0):
     return abs(value.value - published) < 4 * value.error + slack
 
 
-def test_spce_has_the_published_structure_diffusion_turning_and_viscosity():
+def test_spce_has_the_published_structure_diffusion_rotation_and_viscosity():
     results = liquid("spce", 216, 0.997, 200.0)
     g = rigidmd.analysis.rdf(results, "OW", "OW")
     assert near(g.value("g OW-OW: first peak"), 2.75, slack=0.02)
@@ -71,7 +71,7 @@ def test_spce_has_the_published_dielectric_constant():
     assert near(rigidmd.analysis.dielectric(results).value(), 71.0)
 
 
-def test_nitrogen_diffuses_as_its_correlation_of_velocities_says():
+def test_nitrogen_diffuses_as_its_correlation_of_velocities_states():
     results = liquid("nitrogen", 256, 0.8, 80.0, temperature=77.0, trajectory_interval_ps=0.02)
     own = rigidmd.analysis.diffusion(results).value("D of nitrogen")
     memory = rigidmd.analysis.spectrum(results)["correlation V nitrogen"]

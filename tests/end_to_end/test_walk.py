@@ -33,7 +33,7 @@ def _working_directory(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
 
 
-def test_a_walk_tells_wrong_ends_from_true_reasons():
+def test_a_walk_distinguishes_wrong_ends_from_true_reasons():
     assert not reason_against("check", "argon", 0, "500 molecules")
     assert not reason_against("modes", "t_handle", 2, "normal modes need a molecular scene")
     assert "ends with 2" in reason_against("run", "t_handle", 2, "normal modes need")

@@ -54,7 +54,7 @@ def test_samples_give_back_what_was_added():
         (lambda table: np.where(table == 6.0, np.inf, table), "steps that are not whole numbers"),
     ],
 )
-def test_rows_that_are_no_samples_are_refused(change, expected):
+def test_rows_that_are_not_samples_are_refused(change, expected):
     samples = Samples(["a", "b"])
     samples.append(a_sample(6))
     with pytest.raises(ValueError, match=expected):

@@ -237,7 +237,7 @@ def test_some_molecules_of_a_species_freeze_as_a_species_of_their_own_would():
     assert set(system.residue_names) == {"SOL"}
 
 
-def test_describe_tells_which_are_frozen():
+def test_describe_states_which_are_frozen():
     text = describe(
         small_scene({}, 20.0, molecules=[{"model": "spce", "count": 10, "frozen": [2, 3, 7]}])
     )

@@ -62,7 +62,7 @@ def test_energies_are_those_of_the_oracle(counts, edge, truncation):
         assert found.get("coulomb", 0.0) == pytest.approx(coulomb, rel=1e-10)
 
 
-def test_energies_without_box_and_cut_off():
+def test_energies_without_box_and_cutoff():
     system, engine, state = built({"tip4p2005": 3, "argon": 2}, None)
     lj, coulomb = Oracle(system).energy(state.position, state.rotation)
     assert energies(engine, state) == pytest.approx(

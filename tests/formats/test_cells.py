@@ -46,7 +46,7 @@ def test_the_standard_orientation_keeps_the_lattice():
         ((25.0, 30.0, 30.0), "b' = b - a, c' = c - b"),
     ],
 )
-def test_a_cell_leans_by_half_an_edge_as_far_as_files_tell(angles, told):
+def test_a_cell_tilts_by_half_an_edge_as_far_as_files_state(angles, told):
     cell = Box(lengths_A=36.0, angles_deg=angles).cell
     other = reduced_cell(cell)
     basis = basis_of(other, cell)

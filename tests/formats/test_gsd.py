@@ -128,7 +128,7 @@ def test_it_is_what_hoomd_has(run):
     assert energy == pytest.approx(own, rel=1e-5)
 
 
-def test_a_run_goes_on_to_the_same_bytes(tmp_path):
+def test_a_run_continues_to_the_same_bytes(tmp_path):
     same_after_stops(
         forty_waters(NVT, NPT, output=FORTY_WATERS["output"] | {"trajectory": "trajectory.gsd"}),
         [3, 61, 133],
@@ -164,7 +164,7 @@ def test_wrapped_centres_and_no_box(tmp_path):
         ("other", "2 frames of"),
     ],
 )
-def test_a_file_that_changed_is_not_gone_on_with(fault, said, run, tmp_path):
+def test_a_file_that_changed_is_not_continued_with(fault, said, run, tmp_path):
     _, results, states = run
     path = tmp_path / "t.gsd"
     file = GsdFile(path, results.system, True, False)
@@ -202,7 +202,7 @@ def test_a_file_that_changed_is_not_gone_on_with(fault, said, run, tmp_path):
     assert (path.read_bytes() if path.exists() else b"") == before
 
 
-def test_damaged_files_are_told(run, tmp_path):
+def test_damaged_files_are_reported(run, tmp_path):
     """Bytes changed anywhere: frames or a sentence, never anything else."""
     content = (run[0] / "t.gsd").read_bytes()
     path, rng = tmp_path / "t.gsd", np.random.default_rng(5)

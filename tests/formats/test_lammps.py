@@ -333,7 +333,7 @@ def test_tilted_boxes_of_lammps_data(tilts, bounds, general, tmp_path):
         (data_of(WATER_DATA).replace("xlo xhi", "xlo"), "a line 'LOW HIGH xlo xhi' is missing"),
     ],
 )
-def test_lammps_data_that_cannot_be_read_say_where(text, message, tmp_path):
+def test_lammps_data_that_cannot_be_read_state_where(text, message, tmp_path):
     unreadable(message, tmp_path, text, "a.data")
 
 
@@ -429,7 +429,7 @@ def test_labels_of_a_dump_are_named_by_atom_types(columns, tmp_path):
         (("pp pp pp", "pp pp ff"), "its cell is periodic along a, b only"),
     ],
 )
-def test_lammps_dumps_that_cannot_be_read_say_where(change, message, tmp_path):
+def test_lammps_dumps_that_cannot_be_read_state_where(change, message, tmp_path):
     text = dump_of(WATER_DATA, "id type x y z")
     assert change[0] in text
     unreadable(

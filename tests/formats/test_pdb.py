@@ -47,7 +47,7 @@ def test_the_space_group_of_a_pdb_is_reported(group, is_reported, tmp_path):
     assert found.notes == ((note,) if is_reported else ())
 
 
-def test_a_pdb_that_is_cut_off_says_so(tmp_path):
+def test_a_truncated_pdb_is_reported(tmp_path):
     """Cut between two molecules it is a whole file of fewer, but for its end."""
     system = build(small_scene({"spce": 8}, 20.0))
     write_topology(tmp_path / "whole.pdb", system, system.state, wrapped=True)
@@ -136,7 +136,7 @@ def test_coordinates_of_a_pdb_that_are_not_in_columns(tmp_path):
         "CRYST1",
     ],
 )
-def test_a_cryst1_that_is_no_box(box, tmp_path):
+def test_a_cryst1_that_is_not_a_box(box, tmp_path):
     truth = Truth(["spce"] * 3, 14)
     text = pdb(truth.atoms(), box)
     same_molecules(read(tmp_path, text, "a.pdb", cell=truth.cell), truth, 0.002)

@@ -73,7 +73,7 @@ def test_ions_by_names_in_formats_of_force_fields(file, tmp_path):
     same_molecules(read(tmp_path, text, file, species), truth, 1e-4, species)
 
 
-def test_a_damaged_byte_of_a_traj_is_told(tmp_path):
+def test_a_damaged_byte_of_a_traj_is_reported(tmp_path):
     """ASE looks at atomic numbers when their symbols are needed."""
     path = tmp_path / "a.traj"
     ase.io.write(path, ase.Atoms("Ar3", np.eye(3), cell=[9, 9, 9], pbc=True))

@@ -62,7 +62,7 @@ def test_compiling_is_announced_without_a_terminal(tmp_path, monkeypatch, printe
     assert len([line for line in lines if "compiling (" in line]) == 1
 
 
-def test_off_a_terminal_lines_say_how_far_it_is(monkeypatch, capsys):
+def test_off_a_terminal_lines_state_how_far_it_is(monkeypatch, capsys):
     now = [0.0]
     monkeypatch.setattr(progress.clock, "monotonic", lambda: now[0])
 

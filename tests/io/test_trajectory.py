@@ -128,7 +128,7 @@ def test_displacements_over_time_are_speeds(name, tmp_path):
     assert "unwrapped: molecules follow continuous paths" in summary_text(results.summary)
 
 
-def test_the_summary_says_when_positions_are_wrapped():
+def test_the_summary_states_when_positions_are_wrapped():
     scene = small_scene({"argon": 20}, 20.0, output={"positions": "wrapped"})
     assert "Displacements need unwrapped frames" in summary_text(Simulation(scene).run().summary)
     for without in (
@@ -140,7 +140,7 @@ def test_the_summary_says_when_positions_are_wrapped():
         )
 
 
-def test_a_format_too_narrow_for_a_long_way_is_told(tmp_path):
+def test_a_format_too_narrow_for_a_long_way_is_reported(tmp_path):
     scene = small_scene(
         {"argon": 2}, 60.0, output={"trajectory": "t.pdb", "trajectory_interval_ps": 0.002}
     )
@@ -155,7 +155,7 @@ def test_a_format_too_narrow_for_a_long_way_is_told(tmp_path):
         simulation.run()
 
 
-def test_the_topology_is_the_first_frame_relief_included(tmp_path):
+def test_the_topology_is_the_first_frame_overlap_removal_included(tmp_path):
     short = {
         "stages.0.duration_ps": 0.004,
         "stages.1.duration_ps": 0.004,

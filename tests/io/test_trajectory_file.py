@@ -171,7 +171,7 @@ def test_each_molecule_of_a_universe_is_one_fragment(tmp_path, model, sites, kep
 
 
 @pytest.mark.parametrize(("ending", "frame"), list(zip(EVERY_ENDING, cycle((1, -1)), strict=False)))
-def test_united_atoms_of_own_trajectories(tmp_path, ending, frame):
+def test_united_atoms_of_trajectories_of_rigidmd(tmp_path, ending, frame):
     """Sites with mass and no element, and sites with neither, are found by their names in every
     format."""
     system = build(small_scene({"co2_2cljq": 4}, 20.0))
@@ -473,12 +473,12 @@ def test_a_topology_that_cannot_hold_positions_names_its_own_key(name, at, other
     write_topology(tmp_path / name, system, state, wrapped=True)
 
 
-def test_a_trajectory_is_no_molecule(tmp_path):
+def test_a_trajectory_is_not_a_molecule(tmp_path):
     with pytest.raises(StructureError, match="is a trajectory"):
         read_geometry(make(tmp_path, ".gsd")[0])
 
 
-def test_a_run_goes_on_from_a_trajectory(tmp_path):
+def test_a_run_continues_from_a_trajectory(tmp_path):
     """With its velocities; both files are inputs, whose digests and copies are in the folder."""
     first = forty_waters(
         NVT,

@@ -37,7 +37,7 @@ def turn_all(rotor, species, rotation, angular_momentum, h, together):
 
 @pytest.mark.parametrize("moments", ["of every kind", "of two axes", "round"])
 @pytest.mark.parametrize("longest", [0.2, 3.0])
-def test_many_bodies_turn_together_as_one_by_one(moments, longest):
+def test_many_bodies_rotate_together_as_one_by_one(moments, longest):
     """All six orders of axes, symmetric, linear and spherical bodies; short rotates, and some too
     long for the series."""
     rng = np.random.default_rng(4)
@@ -76,7 +76,7 @@ def test_many_bodies_turn_together_as_one_by_one(moments, longest):
     assert np.abs(found[0][0] - rotation).max() > 0.02
 
 
-def test_one_body_that_is_no_number_leaves_its_group_alone():
+def test_one_body_that_is_not_a_number_leaves_its_group_alone():
     rng = np.random.default_rng(5)
     rotor, species = split_rotor(np.array([[1.0, 2.0, 2.5]])), np.zeros(20, int)
     rotation, momentum = random_rotations(rng, 20), rng.standard_normal((20, 3))
@@ -223,7 +223,7 @@ def test_a_free_top_keeps_its_angular_momentum_for_a_million_steps():
 
 
 @pytest.mark.parametrize("inertia", [[0.0, 2.0, 2.0], [2.0, 2.0, 0.0], [3.0, 3.0, 3.0]])
-def test_linear_and_spherical_bodies_turn_exactly(inertia):
+def test_linear_and_spherical_bodies_rotate_exactly(inertia):
     inertia = np.array([inertia])
     momentum = np.array([[0.5, 0.3, -0.4]]) * (inertia > 0)
     q, l = random_rotations(np.random.default_rng(7), 1), momentum.copy()  # noqa: E741
@@ -292,7 +292,7 @@ def test_the_exact_rotor_keeps_energy_and_momentum_for_a_million_steps():
     assert orthogonality_error(q) < 5e-13
 
 
-def test_a_body_that_does_not_turn_or_is_no_number_stays_so():
+def test_a_body_that_does_not_rotate_or_is_not_a_number_stays_so():
     rotor = ExactRotor(*split_rotor(np.array([[0.6, 1.1, 1.7]])))
     q, l = np.eye(3)[None].copy(), np.zeros((1, 3))  # noqa: E741
     spin(rotor, q, l, 0.01, 3)
@@ -302,7 +302,7 @@ def test_a_body_that_does_not_turn_or_is_no_number_stays_so():
     assert np.isnan(l).any()
 
 
-def test_a_turn_too_long_to_mean_anything_becomes_no_number_at_once():
+def test_a_rotation_too_long_to_mean_anything_becomes_no_number_at_once():
     rotor = ExactRotor(*split_rotor(np.array([[0.6, 1.1, 1.7]])))
     q, l = np.eye(3)[None].copy(), np.array([[1e15, 2e15, 3e15]])  # noqa: E741
     spin(rotor, q, l, 1.0, 1)  # in parts of half a radian it would take a year

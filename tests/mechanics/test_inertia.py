@@ -107,7 +107,7 @@ def off_the_surface(shape, points):
             return r + np.maximum(2 * np.abs(z) / d["length_m"] - 1, 0)
 
 
-def test_the_table_says_what_a_scene_must_check():
+def test_the_table_states_what_a_scene_must_check():
     assert set(DIMENSIONS) == set(SOLIDS)
     for shape, dimensions in DIMENSIONS.items():
         assert set(SOLIDS[shape].dimensions) == set(dimensions)

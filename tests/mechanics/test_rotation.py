@@ -100,7 +100,7 @@ def test_sign_of_a_quaternion_is_that_of_its_first_component(quaternion):
     assert not np.any(np.signbit(found) & (found == 0))
 
 
-def test_small_turns_keep_their_digits_in_a_quaternion():
+def test_small_rotations_keep_their_digits_in_a_quaternion():
     vectors = np.array([[1e-12, -2e-12, 3e-12], [0, 0, 1e-150]])
     assert to_quaternion(from_vector(vectors))[:, 1:] == pytest.approx(
         vectors / 2, rel=1e-14, abs=0

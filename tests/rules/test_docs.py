@@ -279,7 +279,9 @@ def own_formats():
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.stem)
-def test_what_a_document_says_can_be_done(document, tmp_path, monkeypatch, capsys, own_formats):
+def test_what_a_document_describes_can_be_done(
+    document, tmp_path, monkeypatch, capsys, own_formats
+):
     shutil.copytree(ROOT / "systems", tmp_path / "systems")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["rigidmd"])
@@ -515,7 +517,7 @@ def test_the_list_of_pages_has_their_titles_and_subjects():
     assert PAGES["contents"].read_text(encoding="utf-8") == contents_text()
 
 
-def test_author_and_version_are_the_same_wherever_they_are_said():
+def test_author_and_version_are_the_same_wherever_they_stand():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     version, (author,) = project["version"], project["authors"]
     text = README.read_text(encoding="utf-8")

@@ -43,7 +43,7 @@ def told(text):
     ]
 
 
-def test_it_is_a_schema_and_says_of_what(capsys):
+def test_it_is_a_schema_and_states_of_what(capsys):
     assert main(["schema"]) == 0
     printed = json.loads(
         capsys.readouterr().out, parse_constant=lambda name: pytest.fail(f"{name} is not JSON")
@@ -116,7 +116,7 @@ def test_shipped_scenes_are_valid():
         ),
     ],
 )
-def test_errors_are_told_where_they_are(scene, old, new, path, message):
+def test_errors_are_reported_where_they_are(scene, old, new, path, message):
     assert told(scene) == []
     assert old in scene
     found = told(scene.replace(old, new, 1))
@@ -137,7 +137,7 @@ def patterns_in(schema_part):
             yield from patterns_in(part)
 
 
-def test_each_pattern_of_a_text_is_in_words():
+def test_each_pattern_of_a_text_is_described():
     assert {*patterns_in(schema())} == {*PATTERNS}
 
 
@@ -155,7 +155,7 @@ def test_each_pattern_of_a_text_is_in_words():
         ({"box.angles_deg": [90.0, 90.0, 180.0]}, "must be less than 180"),
     ],
 )
-def test_texts_and_numbers_are_refused_in_words(keys, message):
+def test_texts_and_numbers_are_refused_with_a_message(keys, message):
     with pytest.raises(SceneError) as refused:
         Scene.from_dict(tomllib.loads(WATER), overrides=keys)
     assert message in str(refused.value)

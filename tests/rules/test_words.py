@@ -85,6 +85,10 @@ ALLOWED = re.compile(
 )
 
 
+#: What names of tests may have, as they are short.
+NOT_IN_NAMES = ("name the thing",)
+
+
 def squeezed(text):
     """Text with one space for a line break and the margin after it."""
     return re.sub(r"\s+", " ", text)
@@ -282,6 +286,20 @@ def test_words_of_the_field():
         errors += found_in(path, comments=True)
         if path.suffix == ".py" and path.is_relative_to(PACKAGE):
             errors += refused_names(path)
+    assert not errors, "\n" + "\n".join(errors)
+
+
+def test_names_of_tests_have_words_of_the_field():
+    errors = []
+    for path in (ROOT / "tests").rglob("test_*.py"):
+        for node in nodes_of(path):
+            if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
+                words = refused_in(node.name.replace("_", " "))
+                errors += [
+                    f"{path.name}: {node.name}: {word}: write {better}"
+                    for _, word, better in words
+                    if better not in NOT_IN_NAMES
+                ]
     assert not errors, "\n" + "\n".join(errors)
 
 

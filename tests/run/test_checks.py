@@ -87,7 +87,7 @@ def test_energy_that_no_scheme_explains():
     assert "timestep_fs is too long" in said
 
 
-def test_a_molecule_that_moves_or_turns_too_far():
+def test_a_molecule_that_moves_or_rotates_too_far():
     said = stopped(water(2.0), change=lambda state: state.velocity.__setitem__(7, 1e3))
     assert "step 0 (0 ps): molecule 8 (spce) moves 3.46 Å" in said
     assert "watch.move = 0.25" in said
@@ -148,7 +148,7 @@ def test_bad_inertia():
     assert "more of its mass on the outer sites" in said
 
 
-def test_q_that_is_no_rotation():
+def test_q_that_is_not_a_rotation():
     simulation = Simulation(water(2.0))
     simulation.system.state.rotation[:] *= 1 + 1e-6  # start_from rejects such a state
     with pytest.raises(SimulationError) as caught:
@@ -158,7 +158,7 @@ def test_q_that_is_no_rotation():
 
 
 @pytest.mark.parametrize("name", ["force", "torque_body"])
-def test_a_load_that_is_no_number(name):
+def test_a_load_that_is_not_a_number(name):
     system = build(water(2.0))
     load, _ = system.engine().evaluate(system.state)
     getattr(load, name)[5, 1] = np.nan
@@ -263,7 +263,7 @@ def test_limits_can_be_set_and_lifted(capsys, tmp_path):
         ({"spce": 20, "nitrogen": 10}, 18.5, 300.0, {"timestep_fs": 6.0, "integrator": "srkn_6"}),
     ],
 )
-def test_ordinary_and_hot_runs_go_on(counts, edge, kelvin, stage):
+def test_ordinary_and_hot_runs_continue(counts, edge, kelvin, stage):
     stage = {"duration_ps": 500 * stage["timestep_fs"] / 1000} | stage
     warnings = []
     scene = small_scene(counts, edge, start={"temperature_K": kelvin}, stages=[stage])
@@ -276,7 +276,7 @@ def test_ordinary_and_hot_runs_go_on(counts, edge, kelvin, stage):
 
 
 @pytest.mark.parametrize("spread", [1e-3, 1e-7, 1e-12])
-def test_bodies_that_are_all_but_linear_go_on(spread):
+def test_bodies_that_are_all_but_linear_continue(spread):
     """They spin about their axis a thousand times faster than they tumble; their sites are barely disturbed by
     it."""
     arms = [site(f"H{k}", 12.0, (x, spread, 0.0), 0.2) for k, x in enumerate((-1.0, 1.0))]
@@ -315,7 +315,7 @@ def test_a_thermostat_cannot_hide_a_step_that_is_too_long(timestep, wrong):
     assert ("the conserved energy drifts by" in told) == wrong
 
 
-def test_looking_costs_no_force_and_changes_no_bit(monkeypatch):
+def test_observing_costs_no_force_and_changes_no_bit(monkeypatch):
     evaluated, loads = [], []
     evaluate, advance = Engine.evaluate, Engine.advance
     monkeypatch.setattr(
@@ -426,7 +426,7 @@ def test_the_stiffest_libration_of_water_is_found_in_few_directions():
         stable_step.DIRECTIONS = before
 
 
-def test_in_a_large_system_a_slab_tells_the_stiffest_motion(monkeypatch):
+def test_in_a_large_system_a_slab_has_the_stiffest_motion(monkeypatch):
     scene = small_scene(
         {"spce": 300},
         20.8,
@@ -444,7 +444,7 @@ def test_in_a_large_system_a_slab_tells_the_stiffest_motion(monkeypatch):
         assert 0.8 * whole.rate < found.rate < 1.001 * whole.rate  # the stiffest of fewer
 
 
-def test_a_step_that_is_too_long_is_told_before_the_first_one(tmp_path):
+def test_a_step_that_is_too_long_is_reported_before_the_first_one(tmp_path):
     warnings = []
     watch = {"move": False, "turn_rad": False, "energy": False}
     scene = water(30.0, stages=[{"duration_ps": 0.03, "timestep_fs": 30.0}], watch=watch)
@@ -500,11 +500,11 @@ def test_a_body_whose_energy_goes_wrong(tmp_path, printed):
     ] == pytest.approx(0.085, rel=1e-3)
 
 
-def test_the_start_of_a_body_can_be_asked_for_at_any_step(printed):
+def test_the_start_of_a_body_can_be_requested_at_any_step(printed):
     assert "kinetic" in printed("energy", TOP, "--set", "run.timestep_s=1.0").out
 
 
-def test_a_body_that_is_lost_turns_too_far_or_loses_q():
+def test_a_body_that_is_lost_rotates_too_far_or_loses_q():
     wild = dict(run__duration_s=30.0, run__integrator="rk4", output__interval_s=0.3)
     assert "step 4 (1.2 s): position or momentum of the body is not finite" in stopped(
         top(run__timestep_s=0.3, **wild)
@@ -532,7 +532,7 @@ def test_no_shipped_body_is_stopped_or_warned_of(path):
 
 
 @pytest.mark.parametrize("resistance", [1e-3, 1.0, 1e3, 1e6])
-def test_a_body_falls_in_oil_of_any_thickness_as_the_closed_form_says(resistance):
+def test_a_body_falls_in_oil_of_any_thickness_as_the_closed_form_states(resistance):
     """m dv/dt = m g - c v, with steps from far below m/c to 1e5 of it."""
     results = Simulation(
         Scene.from_dict(
@@ -587,7 +587,7 @@ def test_a_term_of_somebody_elses_spoils_no_cache(tmp_path):
     assert said == ["2.0", "3.0"]
 
 
-def test_what_went_wrong_is_found_between_looks(monkeypatch):
+def test_what_went_wrong_is_found_between_observations(monkeypatch):
     """Soon after a collapse nothing is where it was; the state at which it is seen is found by
     computing again."""
     ion = {"name": "ion", "count": 5, "sites": [site("X", 20.0, charge=-1.0)]}
@@ -630,7 +630,7 @@ def test_a_long_way_back_is_not_computed_again(monkeypatch):
     assert len({id(state) for state in advanced}) <= 2  # that of compiling, the value of the run
 
 
-def test_a_run_that_blows_up_says_so_and_keeps_the_last_good_state(tmp_path):
+def test_a_run_that_blows_up_is_reported_and_keeps_the_last_good_state(tmp_path):
     simulation = Simulation(
         small_scene({"spce": 20}, 20.0, watch={"move": False}), tmp_path / "out"
     )

@@ -74,7 +74,7 @@ def test_the_gradient_is_that_of_the_enthalpy(coupling, electrostatics):
         assert np.isfinite(point.pressure).all()
 
 
-def test_turns_of_any_size_and_strains_are_those_of_the_docstring():
+def test_rotations_of_any_size_and_strains_are_those_of_the_docstring():
     scene = small_scene(
         MIXTURE,
         13.0,
@@ -248,7 +248,7 @@ def test_a_nitrogen_crystal_finds_its_shape_and_stays():
 
 
 @pytest.mark.parametrize("coupling", ASKED)
-def test_the_cell_takes_the_pressure_asked_for(coupling):
+def test_the_cell_takes_the_pressure_requested(coupling):
     """Each coordinate of the coupling its own; what no coordinate holds stays as it was."""
     asked = {
         "semi_isotropic": (900.0, 900.0, 500.0),

@@ -45,7 +45,7 @@ def test_it_begins_from_overlaps():
     assert np.abs(np.linalg.det(state.rotation) - 1).max() < 1e-12
 
 
-def test_it_says_how_far_it_came():
+def test_it_states_how_far_it_came():
     scene = small_scene({"spce": 10}, 18.5, stages=[stage_of(most_iterations=3)])
     with pytest.warns(
         RigidMDWarning,
@@ -71,7 +71,7 @@ def test_it_can_be_stopped():
     assert found.energy_after < found.energy_before
 
 
-def test_charges_that_nothing_keeps_apart():
+def test_charges_that_nothing_separates():
     ion = {"mass_u": 20.0, "position_A": [0.0, 0.0, 0.0]}
     molecules = [
         {
@@ -91,7 +91,7 @@ def test_charges_that_nothing_keeps_apart():
         simulation.run()
 
 
-def test_atoms_that_are_nearly_in_one_place():
+def test_atoms_that_are_nearly_in_one_position():
     """The squares of their forces exceed the range of numbers."""
     scene = small_scene({"argon": 2}, None, stages=[stage_of()])
     with warnings.catch_warnings():
@@ -110,7 +110,7 @@ def test_a_box_that_nothing_holds_together():
         minimum_of(scene)
 
 
-def test_a_box_that_becomes_too_small_for_the_cut_off():
+def test_a_box_that_becomes_too_small_for_the_cutoff():
     scene = small_scene(
         {"argon": 8}, 12.5, forces={"cutoff_A": 6.0}, stages=[stage_of(pressure_bar=5000.0)]
     )
@@ -172,7 +172,7 @@ def test_bad_input(stages, more, expected):
         small_scene({"spce": 4}, 20.0, stages=stages, **more)
 
 
-def test_accuracy_needs_a_stage_in_which_time_passes():
+def test_accuracy_needs_a_stage_that_is_not_a_minimisation():
     with pytest.raises(SceneError, match="the last stage is a minimisation"):
         measure_accuracy(small_scene({"spce": 4}, 20.0, stages=[stage_of()]))
 

@@ -49,7 +49,7 @@ def energy_error(results):
 
 
 @pytest.mark.soak
-def test_the_energy_error_asked_for_is_kept_with_fewer_forces_than_verlet_needs(tmp_path):
+def test_the_energy_error_requested_is_kept_with_fewer_forces_than_verlet_needs(tmp_path):
     results = Simulation(liquid(integrator="auto", energy_error_kT=1e-5), tmp_path / "a").run()
     stage = results.summary["stages"][1]
     assert stage["integrator"] != "velocity_verlet"
@@ -84,7 +84,7 @@ KEPT = {
 @pytest.mark.soak
 @pytest.mark.parametrize("target", [1e-3, 1e-4, 1e-5, 1e-6])
 @pytest.mark.parametrize("kind", KEPT)
-def test_the_error_asked_for_is_kept_over_a_long_stage(kind, target):
+def test_the_error_requested_is_kept_over_a_long_stage(kind, target):
     """Walks scatter: one in ten is 1.5 times its expected size, which is at most 0.83 of the
     target."""
     counts, edge, forces, temperature = KEPT[kind]
@@ -222,7 +222,7 @@ def told_over_true(known, jump, target):
 
 @pytest.mark.parametrize("target", [1e-4, 1e-6])
 @pytest.mark.parametrize("jump", [0.0, 2.0, 5.0])
-def test_the_error_asked_for_holds_over_the_whole_run_and_not_only_the_pilot(jump, target, known):
+def test_the_error_requested_holds_over_the_whole_run_and_not_only_the_pilot(jump, target, known):
     trial_system, longest, error = known(jump)
     found = choose(trial_system, longest, target, duration=20.0)
     assert target / 5 < error(found) < target
@@ -264,7 +264,7 @@ def test_a_step_that_diverges_in_its_longer_pilot_is_not_chosen(longest_stable, 
 
 
 @pytest.mark.parametrize("target", [1e-8, pytest.param(1e-3, marks=pytest.mark.soak)])
-def test_the_error_of_a_top_is_what_was_asked_for(target):
+def test_the_error_of_a_top_is_what_was_requested(target):
     changes = {"run.integrator": "auto", "run.trajectory_error": target, "run.timestep_s": 0.05}
     simulation = Simulation(Scene.read(TOP, changes))
     results = simulation.run()
@@ -321,7 +321,7 @@ def test_an_error_of_the_trajectory_below_rounding_is_refused():
 
 
 @pytest.mark.soak
-def test_what_cannot_be_kept_is_said(capsys, tmp_path):
+def test_what_cannot_be_kept_is_reported(capsys, tmp_path):
     command = [
         "run",
         str(TOP),
@@ -370,7 +370,7 @@ def test_contradictions_are_refused(stage, fault):
         liquid(**stage)
 
 
-def test_check_says_that_it_is_open(printed):
+def test_check_states_that_it_is_open(printed):
     assert (
         "are chosen before the run"
         in printed(
@@ -392,7 +392,7 @@ def test_check_says_that_it_is_open(printed):
 
 
 @pytest.mark.soak
-def test_a_first_stage_for_which_nothing_can_be_chosen_says_so():
+def test_a_first_stage_for_which_nothing_can_be_chosen_is_reported():
     stages = [{"duration_ps": 0.1, "integrator": "auto", "energy_error_kT": 1e-30}]
     with pytest.raises(
         SimulationError,
@@ -409,7 +409,7 @@ def test_a_first_stage_for_which_nothing_can_be_chosen_says_so():
         None,
     ],
 )
-def test_the_bias_asked_for_sets_the_step(thermostat, tmp_path):
+def test_the_bias_requested_sets_the_step(thermostat, tmp_path):
     """For oscillators w is known: the pilot finds it to the error of its sampling, some per cent."""
     stage = {"integrator": "auto", "bias_kT": 1e-3, "thermostat": thermostat, "duration_ps": 0.2}
     if thermostat != "langevin":
@@ -429,14 +429,14 @@ def test_the_bias_asked_for_sets_the_step(thermostat, tmp_path):
     assert same_bits(results.state, repeated.state)
 
 
-def test_a_large_bias_is_no_reason_for_an_unstable_step():
+def test_a_large_bias_is_not_a_reason_for_an_unstable_step():
     results = Simulation(springs(integrator="auto", bias_kT=10.0, duration_ps=0.2)).run()
     assert results.summary["stages"][0]["timestep_fs"] == pytest.approx(
         1e3 * np.sqrt(39.948 / SPRING), rel=0.03
     )
 
 
-def test_check_says_which_bias_is_asked_for(printed):
+def test_check_states_which_bias_is_requested(printed):
     water = str(ROOT / "systems" / "water.toml")
     more = [
         "--set",

@@ -39,7 +39,7 @@ def argon(folder=None, **options):
     return Simulation(scene, folder, **options)
 
 
-def test_results_are_what_the_log_says(tmp_path):
+def test_results_are_what_the_log_states(tmp_path):
     results = argon(tmp_path / "out").run()
     with (tmp_path / "out" / "log.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -178,7 +178,7 @@ def test_a_data_frame_has_the_headers_of_the_log(tmp_path):
     assert (frame["theta (rad)"] == results["theta"]).all()
 
 
-def test_without_pandas_one_sentence_says_so(monkeypatch):
+def test_without_pandas_one_sentence_reports_it(monkeypatch):
     results = Simulation(Scene.read(TOP, SHORT)).run()
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ImportError, match=r"^to_dataframe\(\) needs pandas: pip install pandas$"):
@@ -408,7 +408,7 @@ def test_paths_and_numbers_of_types_in_a_scene(tmp_path):
         Scene.from_dict(data | {"seed": deep}, tmp_path)
 
 
-def test_the_package_says_that_it_has_types():
+def test_the_package_states_that_it_has_types():
     assert (ROOT / "rigidmd" / "py.typed").is_file()
     assert all(hasattr(rigidmd, name) for name in rigidmd.__all__)
 

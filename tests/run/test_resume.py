@@ -78,7 +78,7 @@ ENSEMBLES = {
         for which in product(ENSEMBLES, ("double", "mixed"))
     ],
 )
-def test_every_ensemble_goes_on_to_the_same_bits(name, precision, tmp_path):
+def test_every_ensemble_continues_to_the_same_bits(name, precision, tmp_path):
     stops = (
         [8, 16, 49, 76] if name == "hybrid_monte_carlo" else [17, 60, 111, 140]
     )  # the ends of trajectories
@@ -98,14 +98,14 @@ def test_every_ensemble_goes_on_to_the_same_bits(name, precision, tmp_path):
         "trajectory.pdb",
     ],
 )
-def test_every_format_goes_on(name, tmp_path):
+def test_every_format_continues(name, tmp_path):
     same_after_stops(
         forty_waters(NVT, output=FORTY_WATERS["output"] | {"trajectory": name}), [31, 80], tmp_path
     )
 
 
 @pytest.mark.soak
-def test_pme_goes_on(tmp_path):
+def test_pme_continues(tmp_path):
     forces = {"cutoff_A": 5.0, "truncation": "shift", "electrostatics": "pme"}
     same_after_stops(
         forty_waters(NPT, NVE, forces=forces, precision="mixed"), [31, 80, 120], tmp_path
@@ -113,7 +113,7 @@ def test_pme_goes_on(tmp_path):
 
 
 @pytest.mark.parametrize("integrator", ["velocity_verlet", "rk4", "dop853"])
-def test_a_body_goes_on(integrator, printed, tmp_path):
+def test_a_body_continues(integrator, printed, tmp_path):
     data = top(integrator)
     looks = Every(0.005, lambda moment: None)
     Simulation(Scene.from_dict(data), tmp_path / "whole", observers=looks).run()
@@ -137,7 +137,7 @@ def test_a_body_goes_on(integrator, printed, tmp_path):
     assert cli.main(["compare", str(tmp_path / "whole"), str(tmp_path / "parts")]) == 1
 
 
-def test_the_command_resume_goes_on_and_lengthens(again, capsys, printed):
+def test_the_command_resume_continues_and_lengthens(again, capsys, printed):
     folder = str(again / "run")
     assert "continuing from step" in printed("resume", folder).err
     assert re.search(
@@ -203,7 +203,7 @@ def test_compare_reports_where_two_runs_diverge(again, stopped, tmp_path, capsys
     assert "is not the folder of a run" in printed("compare", one, tmp_path, code=2).err
 
 
-def test_the_summary_tells_what_a_run_was_made_with(stopped):
+def test_the_summary_states_what_a_run_was_made_with(stopped):
     told = json.loads((stopped / "run" / "summary.json").read_text())
     for package in ("numba", "llvmlite", "numpy", "scipy", "rocket_fft"):
         assert told[f"{package}_version"] == version(package)
@@ -219,7 +219,7 @@ def test_the_summary_tells_what_a_run_was_made_with(stopped):
     assert provenance.scene_digest(own.model_copy(update={"seed": 2})) != told["scene_sha256"]
 
 
-def test_another_version_is_told(again, printed):
+def test_another_version_is_reported(again, printed):
     kept = read_checkpoint(again / "run" / CHECKPOINT)
     del kept.values["with"]["scipy_version"]  # earlier versions of rigidmd did not name it
     kept.values["with"] |= {"numba_version": "0.1", "rocket_fft_version": "0.2"}
@@ -243,7 +243,7 @@ def test_an_input_that_changes_meanwhile_is_the_one_that_was_read(stopped, tmp_p
     }
 
 
-def test_another_scene_is_not_gone_on_with(again, printed):
+def test_another_scene_is_not_continued_with(again, printed):
     command = ["run", str(again / "water.toml"), "-o", str(again / "run"), "--resume"]
     said = printed(*command, "--set", "stages.0.timestep_fs=0.5", "--set", "seed=3", code=2).err
     assert "stages.0.timestep_fs is 0.5, there 1.0" in said and "seed is 3, there 1" in said
@@ -613,7 +613,7 @@ def killed(command: list[str], after: float) -> int:
 
 
 @pytest.mark.parametrize("times", [2, pytest.param(200, marks=pytest.mark.soak)])
-def test_a_run_that_is_killed_goes_on(times, stopped, tmp_path):
+def test_a_run_that_is_killed_continues(times, stopped, tmp_path):
     """kill -9 at random moments, with a checkpoint at every observation, of a run that is longer than
     anybody waits for."""
     scene = [
@@ -713,7 +713,7 @@ CHAINS = {
 }
 
 
-def test_chains_go_on_to_the_same_bits_in_double_precision(tmp_path):
+def test_chains_resume_to_the_same_bits_in_double_precision(tmp_path):
     """A short period, so that the chains have swung when the run stops."""
     stage = CHAINS | {"duration_ps": 0.06, "timestep_fs": 1.0}
     same_after_stops(WATER | {"stages": [stage], "precision": "double"}, [17, 41], tmp_path)

@@ -98,7 +98,7 @@ def test_a_signal_stops_with_a_summary_and_its_code(number, code, tmp_path):
     assert frames_in(folder) >= 1
 
 
-def test_a_signal_of_the_program_s_own_is_left_to_it():
+def test_a_signal_that_the_program_handles_is_left_to_it():
     caught = []
 
     def kill(moment):

@@ -155,7 +155,7 @@ def test_one_point_molecule_runs_under_every_thermostat(thermostat):
         assert results["temperature"][-1] == pytest.approx(2 * kinetic / (3 * BOLTZMANN), rel=0.05)
 
 
-def test_energy_that_goes_with_the_total_momentum_is_booked():
+def test_energy_that_goes_with_the_total_momentum_is_accounted_for():
     """Total momentum goes at steps that the row decides, and its energy into the ledger, whatever
     else acts."""
     system = build(argon())
@@ -173,7 +173,7 @@ def test_energy_that_goes_with_the_total_momentum_is_booked():
     assert seen.energy - state.energy_ledger.sum() == pytest.approx(energy, rel=1e-5)
 
 
-def test_warnings_reach_whoever_calls_from_python():
+def test_warnings_reach_those_who_call_from_python():
     plain = {
         "run.timestep_s": 0.3,
         "run.duration_s": 0.9,
@@ -188,7 +188,7 @@ def test_warnings_reach_whoever_calls_from_python():
     assert caught[0].filename == __file__
 
 
-def test_input_files_of_one_name_are_kept_apart(tmp_path):
+def test_input_files_of_one_name_are_kept_separate(tmp_path):
     model = (ROOT / "rigidmd" / "models" / "argon.toml").read_text()
     for name, mass in (("aa", "39.948"), ("bb", "83.798")):
         (tmp_path / name).mkdir()

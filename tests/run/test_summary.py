@@ -205,7 +205,7 @@ def test_means_are_over_the_equilibrated_part():
         ),
     ],
 )
-def test_the_part_of_means_is_said(given, potential, words, begins):
+def test_the_part_of_means_is_reported(given, potential, words, begins):
     stage = summarised(given, potential=potential)["stages"][0]
     assert stage["means_over"] == words
     assert stage["equilibrated_from_ps"] == (None if begins is None else pytest.approx(begins))
@@ -373,7 +373,7 @@ def test_points_have_one_temperature():
 @pytest.mark.parametrize(
     ("thermostat", "freedom"), [("langevin", 6 * 40), ("velocity_rescaling", 6 * 40 - 3)]
 )
-def test_a_drift_is_told_in_the_thermal_energy_of_the_degrees_of_freedom_of_its_stage(
+def test_a_drift_is_reported_in_the_thermal_energy_of_the_degrees_of_freedom_of_its_stage(
     thermostat, freedom
 ):
     """A thermostat that changes the total momentum has three more. Errors have the same units."""

@@ -301,7 +301,7 @@ def test_every_model_is_in_a_table_here():
     assert {*MODEL_TABLE, *ions} == set(ALL)
 
 
-def test_a_file_says_what_it_is_and_who_says_so():
+def test_a_file_states_what_it_is_and_who_made_it():
     for name in ALL:
         m = load_model(name)
         assert m.name == name
@@ -378,7 +378,7 @@ def test_the_inertia_of_real_molecules(name, constants):
         ("so2", -5.334),
     ],
 )
-def test_charges_in_the_place_of_a_quadrupole(name, quadrupole):
+def test_charges_in_place_of_a_quadrupole(name, quadrupole):
     m = load_model(name)
     if name == "so2":
         row = [i for i, site in enumerate(m.site_names) if site.startswith("Q")]

@@ -82,7 +82,7 @@ def test_a_geometry_with_a_table_of_parameters_is_the_model(own):
     assert found.planar
 
 
-def test_what_a_site_says_itself_goes_before_the_table(own):
+def test_what_a_site_states_itself_goes_before_the_table(own):
     """The scene's entry, a charge of zero too, and in another unit of energy."""
     entry = (
         'sites = [{ name = "H", charge_e = 0.0, sigma_A = 2.5, epsilon_kJ_mol = 0.2 }]\ncount = 8'
@@ -109,7 +109,7 @@ def test_sites_of_a_scene_take_their_parameters_from_the_table_too(own):
     assert found.kind == "linear"
 
 
-def test_check_says_what_kind_of_molecule_it_is(own, printed):
+def test_check_states_what_kind_of_molecule_it_is(own, printed):
     assert (
         "8 benzene: symmetric, planar, 12 sites, 78.1140 u, neutral, no dipole"
         in printed("check", own / "own.toml").out
@@ -174,7 +174,7 @@ def test_copied_files_do_not_rename_a_species(named, own):
         ),
     ],
 )
-def test_faults_of_tables_in_a_scene(change, expected, own, printed):
+def test_errors_of_tables_in_a_scene(change, expected, own, printed):
     (own / "own.toml").write_text(OWN.replace(*change))
     assert expected in printed("check", own / "own.toml", code=2).err
 
@@ -197,12 +197,12 @@ def test_faults_of_tables_in_a_scene(change, expected, own, printed):
         (('title = "aromatic"', "title"), "is not TOML"),
     ],
 )
-def test_faults_of_a_table(change, expected, own, printed):
+def test_errors_of_a_table(change, expected, own, printed):
     (own / "aromatic.toml").write_text(TABLE.replace(*change))
     assert expected in printed("check", own / "own.toml", code=2).err
 
 
-def test_another_mixing_rule_than_the_model_was_made_with_is_said(own, capsys, printed):
+def test_another_mixing_rule_than_the_model_was_made_with_is_reported(own, capsys, printed):
     text = OWN.replace(
         'file = "benzene.xyz"\nparameters = "aromatic.toml"', 'model = "benzene_opls"'
     )
@@ -289,7 +289,7 @@ def test_every_kind_of_molecule_can_be_drawn(name, tmp_path):
 
 
 @pytest.mark.usefixtures("draws")
-def test_a_molecule_of_ones_own_is_shown_and_drawn(tmp_path, printed):
+def test_a_molecule_of_a_user_is_shown_and_drawn(tmp_path, printed):
     """Whatever its sites are called: names are not formulas."""
     sites = "".join(
         f'[[sites]]\nname = "{name}"\nmass_u = 3.0\nposition_A = [0, 0, {12.0 * k}]\n'
@@ -329,7 +329,7 @@ def test_a_model_from_a_structure_reads_back_to_the_same_molecule(own, printed, 
     assert "78.1140 u, neutral" in printed("models", "benzene.toml").out
 
 
-def test_a_model_without_a_table_has_masses_and_says_what_to_fill_in(own, printed, monkeypatch):
+def test_a_model_without_a_table_has_masses_and_states_what_to_fill_in(own, printed, monkeypatch):
     monkeypatch.chdir(own)
     (own / "heavy water.xyz").write_text("4\n\nO 0 0 0\nD 0.96 0 0\nD -0.24 0.93 0\nM 0.1 0.1 0\n")
     out, err = printed("models", "--from", "heavy water.xyz")

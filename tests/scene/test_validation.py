@@ -430,7 +430,7 @@ def test_the_good_scene_is_good(tmp_path, capsys):
     assert main(["run", str(tmp_path / "good.toml"), *arguments]) == 0
 
 
-def test_all_faults_at_once(capsys, tmp_path):
+def test_all_errors_at_once(capsys, tmp_path):
     text = (
         GOOD.replace("20.0", '"a"')
         .replace("count = 20", "count = -1")
@@ -562,7 +562,7 @@ def test_checks_of_tables_do_not_calculate_with_numbers_out_of_range(key, number
     assert "seed" in of_seed
 
 
-def test_files_and_keys_that_are_wrong_are_told_at_once(tmp_path):
+def test_files_and_keys_that_are_wrong_are_reported_at_once(tmp_path):
     (tmp_path / "scene.toml").write_text(
         '[structure]\nfile = "../x.pdb"\n[[molecules]]\nmodel = "spce"\ncoont = 3\n[[molecules]]\nfile = "no.toml"\n'
         "[forces]\ncutoff_A = 1e300\n[[stages]]\nduration_ps = -1.0\n"

@@ -123,7 +123,7 @@ FRESH: list[Mutation] = [
         '(temperatures["temperature_K"] or 0.0) * system.freedom_in(k).total',
         '(temperatures["temperature_K"] or 0.0) * system.freedom.total',
         (
-            "run/test_summary.py::test_a_drift_is_told_in_the_thermal_energy_of_the_degrees_of_freedom_of_its_stage",
+            "run/test_summary.py::test_a_drift_is_reported_in_the_thermal_energy_of_the_degrees_of_freedom_of_its_stage",
         ),
     ),
     Mutation(
@@ -140,7 +140,7 @@ FRESH: list[Mutation] = [
         "run/pilot/sampling.py",
         "BIAS = 1 / 24",
         "BIAS = 1 / 12",
-        ("run/test_pilot.py::test_the_bias_asked_for_sets_the_step",),
+        ("run/test_pilot.py::test_the_bias_requested_sets_the_step",),
     ),
     Mutation(
         "F16",
@@ -157,7 +157,7 @@ FRESH: list[Mutation] = [
         "system.moments(times)[1] @ system.axes.T)",
         "system.moments(times)[1])",
         (
-            "features/bodies/test_frames.py::test_wheels_drives_and_friction_in_a_turning_accelerated_frame",
+            "features/bodies/test_frames.py::test_wheels_drives_and_friction_in_a_rotating_accelerated_frame",
         ),
     ),
     Mutation(
@@ -166,7 +166,7 @@ FRESH: list[Mutation] = [
         "assemble/structure.py",
         "velocity = None if atoms.velocity is None else atoms.velocity @ rotation.T",
         "velocity = atoms.velocity",
-        ("assemble/test_structure.py::test_a_turned_cell_turns_velocities_too",),
+        ("assemble/test_structure.py::test_a_rotated_cell_rotates_velocities_too",),
     ),
     Mutation(
         "F19",
@@ -208,7 +208,7 @@ FRESH: list[Mutation] = [
         "forces/ewald/interactions.py",
         "part = accuracy * sqrt(filled / 2)",
         "part = accuracy * sqrt(filled)",
-        ("forces/ewald/test_errors.py::test_forces_are_as_accurate_as_asked_for",),
+        ("forces/ewald/test_errors.py::test_forces_are_as_accurate_as_requested",),
     ),
     Mutation(
         "F24",
@@ -259,7 +259,7 @@ FRESH: list[Mutation] = [
         "{site.cross / NM:.12g}",
         "{site.cross:.12g}",
         (
-            "features/external/test_settings.py::test_gromacs_places_a_site_off_the_plane_of_its_masses",
+            "features/external/test_settings.py::test_gromacs_has_a_site_off_the_plane_of_its_masses",
         ),
     ),
     Mutation(
@@ -290,7 +290,7 @@ FRESH: list[Mutation] = [
         "None if error is None else error / n",
         "None if error is None else error / n**0.5",
         (
-            "features/studies/sweep/test_table.py::test_the_energy_of_a_molecule_has_its_share_of_the_error",
+            "features/studies/sweep/test_table.py::test_the_energy_of_a_molecule_has_its_fraction_of_the_error",
         ),
     ),
     Mutation(
@@ -317,7 +317,7 @@ FRESH: list[Mutation] = [
         "run/molecular_observers.py",
         "since = self._begins.setdefault(now.stage, max(0, len(samples) - 1))",
         "since = self._begins.setdefault(now.stage, len(samples))",
-        ("run/test_results.py::test_results_are_what_the_log_says",),
+        ("run/test_results.py::test_results_are_what_the_log_states",),
     ),
     Mutation(
         "F36",
@@ -342,7 +342,7 @@ FRESH: list[Mutation] = [
         "            force, torque = _rotated(force, axes.T), _rotated(torque, axes.T)",
         "            force, torque = _rotated(force, axes.T), torque",
         (
-            "features/bodies/test_frames.py::test_wheels_drives_and_friction_in_a_turning_accelerated_frame",
+            "features/bodies/test_frames.py::test_wheels_drives_and_friction_in_a_rotating_accelerated_frame",
         ),
     ),
     Mutation(
@@ -436,7 +436,7 @@ FRESH: list[Mutation] = [
         "        xz = (cell[2, 0] - built[2, 0] * xx - built[2, 1] * xy) / built[2, 2]",
         "        xz = (cell[2, 0] - built[2, 0] * xx) / built[2, 2]",
         (
-            "features/potentials/test_pair_list.py::test_the_list_is_built_anew_where_a_strain_of_a_triclinic_cell_exceeds_its_skin",
+            "features/potentials/test_pair_list.py::test_the_list_is_rebuilt_where_a_strain_of_a_triclinic_cell_exceeds_its_skin",
         ),
     ),
     Mutation(
@@ -558,7 +558,7 @@ FRESH: list[Mutation] = [
         "count * (count - 1) * together.error**2",
         "count * together.error**2",
         (
-            "features/studies/test_extrapolation.py::test_a_value_of_runs_together_takes_the_place_of_the_mean_of_their_values",
+            "features/studies/test_extrapolation.py::test_a_value_of_runs_together_replaces_the_mean_of_their_values",
         ),
     ),
     Mutation(
@@ -752,7 +752,7 @@ FRESH: list[Mutation] = [
         "_finite_or_none(line.error * 1000 / n)",
         "_finite_or_none(line.error * 1000 / n**0.5)",
         (
-            "run/test_summary.py::test_a_drift_is_told_in_the_thermal_energy_of_the_degrees_of_freedom_of_its_stage",
+            "run/test_summary.py::test_a_drift_is_reported_in_the_thermal_energy_of_the_degrees_of_freedom_of_its_stage",
         ),
     ),
     Mutation(
@@ -845,6 +845,8 @@ FRESH: list[Mutation] = [
         "engines/lammps/files.py",
         'sqrt(p["epsilon_kJ_mol"] * q["epsilon_kJ_mol"])',
         '(p["epsilon_kJ_mol"] + q["epsilon_kJ_mol"]) / 2',
-        ("features/external/test_lammps.py::test_a_liquid_of_ellipsoids_beside_sites_is_the_same",),
+        (
+            "features/external/test_lammps.py::test_a_liquid_of_ellipsoids_next_to_sites_is_the_same",
+        ),
     ),
 ]

@@ -83,7 +83,7 @@ CORE = [
         "frame_rate(frame, time + 0.5 * h)",
         "frame_rate(frame, time)",
         (
-            "features/bodies/test_frames.py::test_a_changing_or_accelerating_frame_agrees_with_one_that_does_not_turn",
+            "features/bodies/test_frames.py::test_a_changing_or_accelerating_frame_agrees_with_one_that_does_not_rotate",
         ),
     ),
     Mutation(
@@ -316,7 +316,7 @@ RINGS = [
         "    state.extra_variables[:] = 0.0\n    if (np.isfinite(state.cell) != np.isfinite(like.cell)).any():",
         (
             "io/test_checkpoint.py::test_a_checkpoint_gives_back_all_of_a_state",
-            "run/test_resume.py::test_chains_go_on_to_the_same_bits_in_double_precision",
+            "run/test_resume.py::test_chains_resume_to_the_same_bits_in_double_precision",
         ),
     ),
     Mutation(  # harmless within a run, whose steps count on; a stage that is run alone would repeat the numbers
@@ -409,7 +409,7 @@ RINGS = [
         "forces/ewald/dispersion.py",
         "    part = _error(accuracy, species, counts) * sqrt(composition.filled / 2)",
         "    part = _error(accuracy, species, counts) * 2",
-        ("forces/ewald/test_dispersion.py::test_forces_are_as_accurate_as_asked_for",),
+        ("forces/ewald/test_dispersion.py::test_forces_are_as_accurate_as_requested",),
     ),
     Mutation(
         "D4",

@@ -431,7 +431,7 @@ def test_coasting_spin(viscous, dry):
         assert 0 < last[0] < 1e-7 and last[1] == 0
 
 
-def test_wheel_turn():
+def test_wheel_rotation():
     times = np.linspace(0, 5, 11)
     late = integrated(lambda t, y: [y[1], -0.3 / 4.0 if t < 2 else 0.0], [0.0, 0.0], times[:5])[
         :, 0

@@ -55,7 +55,7 @@ ROWS = {
     [(name, "double") for name in ROWS]
     + [pytest.param(name, "mixed", marks=pytest.mark.soak) for name in ROWS],
 )
-def test_a_look_takes_the_energies_of_the_last_step(name, precision, monkeypatch):
+def test_an_observation_takes_the_energies_of_the_last_step(name, precision, monkeypatch):
     """They are those of an evaluation, to the bit, and the run continues as if nobody had observed."""
     electrostatics = "pme" if precision == "double" else "reaction_field"
     forces = {"cutoff_A": 5.5, "electrostatics": electrostatics, "tail_correction": True}
@@ -101,7 +101,7 @@ class Spring(rigidmd.Force):
         return 0.5 * (state.position**2).sum(), -state.position
 
 
-def test_a_look_asks_a_force_in_python_once():
+def test_an_observation_calls_a_force_in_python_once():
     system = build(small_scene({"argon": 10}, 25.0).with_user_code([spring := Spring()]))
     engine, row = system.engine(), SCHEMES["velocity_verlet"]
     state = engine.begin(system.state, row)
@@ -113,7 +113,7 @@ def test_a_look_asks_a_force_in_python_once():
     assert spring.asked == asked + 1
 
 
-def test_a_look_at_another_state_is_an_evaluation():
+def test_an_observation_of_another_state_is_an_evaluation():
     system, engine, start = built({"argon": 20}, 20.0, 3)
     row = SCHEMES["velocity_verlet"]
     moved, other = engine.begin(start, row), engine.begin(start, row)
@@ -126,7 +126,7 @@ def test_a_look_at_another_state_is_an_evaluation():
     )
 
 
-def test_a_look_at_a_state_that_was_changed_from_outside_is_anew():
+def test_an_observation_of_a_state_that_was_changed_from_outside_is_new():
     _, engine, state = built({"argon": 20}, 25.0)
     row = SCHEMES["velocity_verlet"]
     engine.advance(state, row, 1e-3, 5, observed=True)

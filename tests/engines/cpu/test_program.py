@@ -63,7 +63,7 @@ def test_a_status_ends_a_program():
     assert log[1:7].tolist() == [10, 20, 30, 10, 20, 10]
 
 
-def test_what_is_never_used_is_no_row():
+def test_what_is_never_used_is_not_a_row():
     program, _ = made(uses=EARLY)
     assert program.rows.when.tolist() == [ALWAYS, EARLY]
 

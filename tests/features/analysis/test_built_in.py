@@ -52,7 +52,7 @@ def test_peaks_of_few_frames_have_no_value(frames):
         assert found.note.startswith("too short for an error. So far: ")
 
 
-def test_one_sentence_tells_what_is_too_short():
+def test_one_sentence_states_what_is_too_short():
     assert converged_value("x", "D", 1.0, 0.1, 11.0, 1.0).note == (
         "11 ps are 11 correlation times of 1 ps, too short for a value; 20 of them are 20 ps. So far: 1.00 ± 0.10 D"
     )

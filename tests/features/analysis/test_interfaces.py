@@ -438,7 +438,7 @@ def test_densities_of_a_slab_that_change_slowly_have_honest_errors(seeds):
         assert 0.4 < np.sqrt(np.mean(np.square(pulls))) < (2.0 if seeds < 20 else 1.4), name
 
 
-def test_a_surface_tension_without_the_pressure_tensor_says_what_to_set():
+def test_a_surface_tension_without_the_pressure_tensor_states_what_to_set():
     rng = np.random.default_rng(6)
     system, positions, cell, _ = synthetic(rng, 60)
     Q = random_rotations(rng, 60 * 600).reshape(60, 600, 3, 3)
@@ -448,7 +448,7 @@ def test_a_surface_tension_without_the_pressure_tensor_says_what_to_set():
         surface_tension(history(system, np.arange(60.0), positions, cell, Q))
 
 
-def test_what_is_no_slab_is_refused():
+def test_what_is_not_a_slab_is_refused():
     system = system_of({"spce": 64}, 12.5)
     rng = np.random.default_rng(1)
     Q = random_rotations(rng, 640).reshape(10, 64, 3, 3)

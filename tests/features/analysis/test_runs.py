@@ -286,7 +286,7 @@ def test_a_run_that_was_killed_is_analysed_as_far_as_it_came(copy, capsys):
     assert found["to_ps"] < 0.16 and found["frames"] == 34
 
 
-def test_a_folder_that_is_no_run_of_molecules(tmp_path, copy, capsys):
+def test_a_folder_that_is_not_a_run_of_molecules(tmp_path, copy, capsys):
     assert "nowhere" in said(capsys, tmp_path / "nowhere")
     assert str(tmp_path) in said(capsys, tmp_path)
     (copy / "trajectory.trr").write_bytes(b"nothing")
@@ -325,7 +325,7 @@ def test_a_folder_that_is_no_run_of_molecules(tmp_path, copy, capsys):
         "\xff",
     ],
 )
-def test_a_damaged_table_is_told_and_kept(text, copy, capsys):
+def test_a_damaged_table_is_reported_and_kept(text, copy, capsys):
     path = copy / "analysis.json"
     path.write_text(text, encoding="latin-1")
     before = names(copy)
@@ -361,7 +361,7 @@ def test_files_of_others_are_not_overwritten(copy, capsys):
 @pytest.mark.skipif(
     not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere"
 )
-def test_a_folder_that_cannot_be_written_is_told(copy, capsys):
+def test_a_folder_that_cannot_be_written_is_reported(copy, capsys):
     copy.chmod(0o555)
     try:
         assert str(copy) in said(capsys, copy, "--only", "msd")
@@ -384,7 +384,7 @@ def spins(frames):
 """
 
 
-def test_a_function_of_ones_own_is_found_by_name(copy, capsys):
+def test_a_function_of_a_user_is_found_by_name(copy, capsys):
     (copy.parent / "own.py").write_text(OWN)
     trust = ["--trust", str(copy.parent / "own.py"), "--from", "0.02ps"]
     assert cli.main(["analyse", str(copy), *trust, "-v", "--only", "height,spins"]) == 0
@@ -400,7 +400,7 @@ def test_a_function_of_ones_own_is_found_by_name(copy, capsys):
     )  # the same function once more
 
 
-def test_the_mean_of_ones_own_has_an_honest_error():
+def test_the_mean_of_a_user_has_an_honest_error():
     from support.common import history, noise_with_memory, system_of
 
     system, found = system_of({"argon": 2}), []
@@ -438,7 +438,7 @@ def lambda_of(series):
         ("raise SystemExit(0)", "raised SystemExit"),
     ],
 )
-def test_a_function_of_ones_own_that_is_wrong(body, words, water, tmp_path, capsys):
+def test_a_function_of_a_user_that_is_wrong(body, words, water, tmp_path, capsys):
     before = names(water)
     (tmp_path / "own.py").write_text(
         f"import rigidmd\n@rigidmd.analysis.register\ndef mine(frames):\n    {body}\n"
@@ -469,7 +469,7 @@ def test_a_function_of_ones_own_that_is_wrong(body, words, water, tmp_path, caps
         ),
     ],
 )
-def test_a_file_of_ones_own_that_is_wrong(text, words, water, tmp_path, capsys):
+def test_a_file_of_a_user_that_is_wrong(text, words, water, tmp_path, capsys):
     (tmp_path / "own.py").write_text(text)
     assert words in said(capsys, water, "--trust", tmp_path / "own.py")
 
@@ -606,7 +606,7 @@ def text_run(tmp_path_factory):
     ],
     ids=["number", "nan", "torn", "one", "uneven"],
 )
-def test_frames_that_are_spoilt_are_told(spoil, words, text_run, tmp_path, capsys):
+def test_frames_that_are_spoilt_are_reported(spoil, words, text_run, tmp_path, capsys):
     folder = Path(shutil.copytree(text_run, tmp_path / "run"))
     lines = (folder / "t.xyz").read_text().splitlines()
     frames = [lines[k : k + 650] for k in range(0, len(lines), 650)]
@@ -616,7 +616,7 @@ def test_frames_that_are_spoilt_are_told(spoil, words, text_run, tmp_path, capsy
     assert words in said(capsys, folder, "--only", "msd", "--from", "0.02ps")
 
 
-def test_friction_on_each_molecule_is_told(water):
+def test_friction_on_each_molecule_is_reported(water):
     record = read_record(water)
     assert "thermostat" not in " ".join(frames_of_folder(record, 0.02).notes)
     stages = tuple(
@@ -632,7 +632,7 @@ def test_friction_on_each_molecule_is_told(water):
 
 
 @pytest.mark.usefixtures("reads_here")
-def test_stages_of_one_name_are_told_apart(tmp_path):
+def test_stages_of_one_name_are_distinguished(tmp_path):
     """Production is the last stage, also where an earlier one has its name."""
     stages = [
         {"name": "x", "ensemble": "nvt", "temperature_K": 90.0, "duration_ps": 0.02},

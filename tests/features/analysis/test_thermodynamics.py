@@ -319,7 +319,7 @@ def test_a_short_run_has_no_value():
         assert value.value is None and "100 of them are" in value.note and "So far" in value.note
 
 
-def test_what_an_ensemble_lacks_is_said():
+def test_what_an_ensemble_lacks_is_reported():
     rng = np.random.default_rng(7)
     assert "c_p, kappa_T and alpha_p need a stage with ensemble = 'npt'" in str(
         response(liquid(rng, "nvt", 20.0))

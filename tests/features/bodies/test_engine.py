@@ -23,7 +23,7 @@ from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 
 
-def test_a_call_of_no_steps_is_no_step():
+def test_a_call_of_no_steps_is_not_a_step():
     system = build_body(Scene.from_dict(PINNED))
     ends = []
     for calls in ((10,), (0, 10)):
@@ -145,7 +145,7 @@ def test_a_python_function_can_apply_what_a_scene_does():
 @pytest.mark.parametrize(
     "answer", [None, [1, 2, 3], ([1, 2], [0, 0, 0]), ([np.nan, 0, 0], [0, 0, 0])]
 )
-def test_a_python_function_that_gives_no_force_is_told_so(answer):
+def test_a_python_function_that_gives_no_force_is_reported(answer):
     with pytest.raises(SimulationError, match="t = 0 s: an applied function gave"):
         simulate(FREE, {"odd": lambda pose: answer})
     with pytest.raises(SceneError, match="'gravity' is the name of a force of the scene"):
@@ -350,7 +350,7 @@ def test_takahashi_imada_is_of_order_four_but_for_a_change_of_variables():
         assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.1)
 
 
-def test_a_gradient_is_not_asked_of_forces_that_have_none():
+def test_a_gradient_is_not_required_of_forces_that_have_none():
     for more in (
         {"friction": {"viscous_N_m_s": [0.1, 0.1, 0.1]}},
         {"applied": [{"force_N": [1.0, 0, 0]}]},

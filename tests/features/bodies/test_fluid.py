@@ -157,7 +157,7 @@ def test_weight_and_buoyancy_are_minus_the_gradient_of_their_energy():
 
 
 @pytest.mark.parametrize("strength", [1e-6, 1.0, 1e3, 1e6, 1e12])
-def test_quadratic_resistance_never_lets_go(strength):
+def test_quadratic_resistance_never_ends(strength):
     """However strong, it brakes, and never past zero: |v| at the middle of a kick is the value of the
     resistance itself."""
     point = {
@@ -191,7 +191,7 @@ def test_quadratic_resistance_never_lets_go(strength):
     assert spin == pytest.approx(speed, rel=1e-9, abs=1e-12)
 
 
-def test_a_stone_let_go_in_a_stiff_fluid_falls_at_its_terminal_speed():
+def test_a_stone_released_in_a_stiff_fluid_falls_at_its_terminal_speed():
     stone = {
         "body": {"mass_kg": 1.0},
         "gravity": {},

@@ -20,7 +20,7 @@ from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 
 
-def test_wheels_drives_and_friction_in_a_turning_accelerated_frame():
+def test_wheels_drives_and_friction_in_a_rotating_accelerated_frame():
     q, w = rotor_end(1.0)
     gaps = []
     for dt in (2e-3, 1e-3):
@@ -151,7 +151,7 @@ def test_courses():
     assert value_at(window([1.0, 0, 0], 0.0, np.inf), np.array([0.0, 1e9]))[:, 0].tolist() == [1, 1]
 
 
-def test_a_changing_or_accelerating_frame_agrees_with_one_that_does_not_turn():
+def test_a_changing_or_accelerating_frame_agrees_with_one_that_does_not_rotate():
     # a free body that nothing acts on, given in a frame that spins up about a fixed direction: exact
     rest = simulate(FREE, gravity__acceleration_m_s2=[0.0, 0.0, 0.0])
     direction = np.array([1.0, 2.0, -1.0])
@@ -170,7 +170,7 @@ def test_a_changing_or_accelerating_frame_agrees_with_one_that_does_not_turn():
     )  # not conserved in such a frame, and not stated to be
 
 
-def test_the_same_scene_gives_the_same_bits_however_often_it_is_looked_at():
+def test_the_same_scene_gives_the_same_bits_however_often_it_is_observed():
     ends = [simulate(PINNED | ROTOR, output__interval_s=dt).state for dt in (0.01, 0.07, 1.0, 1.0)]
     for other in ends[1:]:
         assert same_bits(ends[0], other)

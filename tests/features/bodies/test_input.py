@@ -268,7 +268,7 @@ def faults(**tables):
         ),
     ],
 )
-def test_each_fault_has_its_message(text, message):
+def test_each_error_has_its_message(text, message):
     """Tables of a scene, as TOML; those of `run` are added to its two numbers."""
     tables = tomllib.loads(text)
     if "run" in tables:
@@ -276,7 +276,7 @@ def test_each_fault_has_its_message(text, message):
     assert message in faults(**tables)
 
 
-def test_all_faults_come_at_once_with_their_lines(tmp_path, printed):
+def test_all_errors_come_at_once_with_their_lines(tmp_path, printed):
     path = tmp_path / "bad.toml"
     path.write_text(
         "[body]\nmass_kg = 1\ninertia_kg_m2 = [1, 2, 4]\npinned = true\n\n"
@@ -299,7 +299,7 @@ def test_all_faults_come_at_once_with_their_lines(tmp_path, printed):
     assert not (tmp_path / "out").exists()
 
 
-def test_all_faults_of_solids_come_at_once_with_their_lines(tmp_path, printed):
+def test_all_errors_of_solids_come_at_once_with_their_lines(tmp_path, printed):
     path = tmp_path / "bad.toml"
     path.write_text(
         "[[body.solids]]\nshape = 'ring'\nradius_m = 1\ndensity_kg_m3 = 2\naxis = [0, 0, 0]\n\n"
@@ -320,7 +320,7 @@ def test_the_energy_of_a_body_is_in_joule(printed):
     assert "5435.696790865" in printed("energy", scene).out
 
 
-def test_what_is_no_scene_of_either_kind_says_so(tmp_path, printed):
+def test_what_is_not_a_scene_of_either_kind_is_reported(tmp_path, printed):
     path = tmp_path / "what.toml"
     path.write_text("name = 'x'\n")
     assert (

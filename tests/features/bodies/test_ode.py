@@ -56,7 +56,7 @@ def test_the_textbook_systems_are_the_same_motion(scene, formulation):
         assert np.log2(error / fine.summary["largest_orthogonality_error"]) > 3.5
 
 
-def test_a_run_that_cannot_go_on_says_when():
+def test_a_run_that_cannot_continue_states_when():
     def singular(pose):  # falls into a centre
         return -1e3 * pose.position / np.linalg.norm(pose.position) ** 6, np.zeros(3)
 

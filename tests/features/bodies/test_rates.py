@@ -166,7 +166,7 @@ def test_a_t_handle_flips_as_in_theory(tmp_path, printed):
     assert "every 1.191569 s; in theory 1.191569" in (tmp_path / "t" / "report.html").read_text()
 
 
-def test_a_wobble_about_a_stable_axis_is_no_flip():
+def test_a_wobble_about_a_stable_axis_is_not_a_flip():
     found = rates(shipped("free_asymmetric_top", run__duration_s=20.0))
     assert set(found) == {"omega_period_s"}
     measured, theory = found["omega_period_s"]

@@ -206,7 +206,7 @@ def test_trajectories_show_the_body(name, tmp_path):
 
 
 @pytest.mark.parametrize("path", BODIES, ids=lambda path: path.stem)
-def test_check_tells_every_scene(path, printed):
+def test_check_describes_every_scene(path, printed):
     said = printed("check", path).out
     assert "degrees of freedom" in said
     assert "omitted:" in said
@@ -285,7 +285,7 @@ def test_wheels_are_shown(tmp_path):
     assert repr(results).count("\n") == 0
 
 
-def test_a_run_says_what_is_wrong_with_it():
+def test_a_run_reports_what_is_wrong_with_it():
     scene = Scene.read(
         TOP,
         {"output.trajectory": False, "run.integrator": "velocity_verlet", "run.timestep_s": 0.06},
@@ -297,7 +297,7 @@ def test_a_run_says_what_is_wrong_with_it():
     assert "rotates by more than 180° between samples" in said
 
 
-def test_what_a_trajectory_cannot_hold_is_told(tmp_path):
+def test_what_a_trajectory_cannot_hold_is_reported(tmp_path):
     stone = {
         "body": {"mass_kg": 1.0, "solid": {"shape": "sphere", "radius_m": 0.05}},
         "run": {"duration_s": 1.0, "timestep_s": 0.1},
@@ -386,7 +386,7 @@ def stiff(tmp_path, friction, integrator="dop853"):
 
 
 @pytest.mark.parametrize("integrator", ["dop853", "radau"])
-def test_a_solver_of_many_steps_of_its_own_ends_between_two_looks_and_resumes_to_the_same_bits(
+def test_a_solver_of_many_internal_steps_ends_between_two_observations_and_resumes_to_the_same_bits(
     tmp_path, integrator
 ):
     scene = stiff(tmp_path, 1e3, integrator)

@@ -53,7 +53,7 @@ def worst(results, name):
 
 
 @pytest.mark.parametrize("path", BODIES, ids=lambda path: path.stem)
-def test_every_scene_keeps_what_it_should_and_says_what_to_look_at(path):
+def test_every_scene_keeps_what_it_should_and_states_what_to_look_at(path):
     assert "What to look for" in path.read_text()
     results = run(path.stem)
     assert len(results["time"]) >= 450  # enough to draw
@@ -192,7 +192,7 @@ def test_nutation_and_mean_precession_of_heavy_tops(k):
         (7, "cusps"),
     ],
 )
-def test_the_seven_pictures_are_what_their_names_say(k, picture):
+def test_the_seven_pictures_are_what_their_names_state(k, picture):
     results = run(f"heavy_top_{k}")
     precession = np.gradient(np.unwrap(results["phi"]), results["time"])
     theta = results["theta"]
@@ -563,7 +563,7 @@ def test_the_split_rotor_has_the_best_of_all_orders(inertia):
 
 @pytest.mark.parametrize("inertia", MOMENTS[:5])
 @pytest.mark.parametrize("order", [None, (0, 1, 2), (2, 0, 1), (1, 0, 2)])
-def test_the_split_rotor_conserves_the_energy_that_theory_says(inertia, order):
+def test_the_split_rotor_conserves_the_energy_that_theory_states(inertia, order):
     """H + h²/24 times the quartic of SplitRotor's docstring is kept to order 4."""
     rotor, rotation, momentum = thermal_bodies(inertia, 40)
     if order is not None:
@@ -621,7 +621,7 @@ def test_the_split_rotor_is_of_order_two_reversible_and_keeps_momentum(inertia, 
 @pytest.mark.parametrize(
     ("inertia", "axis"), [((1, 1, 2), 2), ((2, 1, 1), 0), ((1, 2, 1), 1), ((2, 2, 0.3), 2)]
 )
-def test_a_symmetric_body_is_one_turn_about_momentum_and_one_about_its_axis(inertia, axis):
+def test_a_symmetric_body_is_one_rotation_about_momentum_and_one_about_its_axis(inertia, axis):
     rotor = split_rotor(np.array([inertia], float))
     assert rotor.order[0, 2] == axis
     assert (np.flatnonzero(rotor.excess[0]) == axis).all()

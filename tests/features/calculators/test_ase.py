@@ -116,7 +116,7 @@ def test_a_scene_holds_its_atoms(waters, tmp_path):
     assert made != rigidmd.scene_from_atoms(waters[:-3], ["spce"], **tables, seed=3, name="mine")
 
 
-def test_a_run_of_held_atoms_goes_on(waters, tmp_path):
+def test_a_run_of_held_atoms_continues(waters, tmp_path):
     made = rigidmd.scene_from_atoms(waters, ["spce"], forces=FORCES, stages=[NVE], output=OUTPUT)
     looks = Every(0.001, lambda moment: None)
     Simulation(made, tmp_path / "whole", observers=looks).run()
@@ -133,7 +133,7 @@ def test_a_run_of_held_atoms_goes_on(waters, tmp_path):
         Simulation(moved, tmp_path / "parts", resume=True).run()
 
 
-def test_what_a_scene_of_atoms_is_without_being_told():
+def test_what_a_scene_of_atoms_is_without_being_set():
     water = molecule("H2O")
     still = rigidmd.scene_from_atoms(water, "spce")
     assert still.stages[0].ensemble == "minimise"
@@ -225,7 +225,7 @@ def broken(what: str) -> Atoms:
         ("bent", r"molecule 1 .* is not spce: an atom is .* Å from the rigid template"),
     ],
 )
-def test_atoms_that_cannot_be_used_are_told(what, said):
+def test_atoms_that_cannot_be_used_are_reported(what, said):
     atoms = broken(what)
     for use in (
         lambda: build(rigidmd.scene_from_atoms(atoms, "spce")),
@@ -254,7 +254,7 @@ def test_atoms_that_cannot_be_used_are_told(what, said):
         ({"stages": [{"duration_ps": 1.0}]}, r"start\.temperature_K is missing"),
     ],
 )
-def test_settings_that_cannot_be_used_are_told(settings, said):
+def test_settings_that_cannot_be_used_are_reported(settings, said):
     with pytest.raises(SceneError, match=said):
         rigidmd.scene_from_atoms(**{"atoms": molecule("H2O"), "models": ["spce"]} | settings)
 

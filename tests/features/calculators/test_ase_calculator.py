@@ -284,7 +284,7 @@ def test_rigid_molecules_are_minimised(waters):
     assert np.abs(moved - distances).max() > 0.1
 
 
-def test_bent_molecules_are_told_once():
+def test_bent_molecules_are_reported_once():
     atoms = molecule("H2O")
     atoms.calc = RigidMD("spce")
     with pytest.warns(

@@ -135,7 +135,7 @@ def test_ase_reads_a_run(name, tmp_path, monkeypatch):
         ase.io.read(tmp_path, format="rigidmd")
 
 
-def test_a_run_with_it_goes_on_to_the_same_bytes(tmp_path):
+def test_a_run_with_it_continues_to_the_same_bytes(tmp_path):
     output = FORTY_WATERS["output"] | {
         "trajectory": "trajectory.traj",
         "trajectory_interval_ps": 0.001,
@@ -143,7 +143,7 @@ def test_a_run_with_it_goes_on_to_the_same_bytes(tmp_path):
     same_after_stops(forty_waters(NVE | {"duration_ps": 0.1}, output=output), [3, 41, 43], tmp_path)
 
 
-def test_a_damaged_one_is_told(traj, tmp_path):
+def test_a_damaged_one_is_reported(traj, tmp_path):
     """Bytes changed anywhere: frames or a sentence, never anything else."""
     content = (traj[0] / "trajectory.traj").read_bytes()
     path, rng, sites = tmp_path / "t.traj", np.random.default_rng(5), len(traj[1].system.sites.name)
@@ -169,7 +169,7 @@ def test_a_damaged_one_is_told(traj, tmp_path):
         ("noise", "not a trajectory of ASE"),
     ],
 )
-def test_one_that_changed_is_not_gone_on_with(fault, said, traj, tmp_path):
+def test_one_that_changed_is_not_continued_with(fault, said, traj, tmp_path):
     _, results, states, _ = traj
     path = tmp_path / "t.traj"
     file = TrajFile(path, results.system, True, False)

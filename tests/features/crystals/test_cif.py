@@ -268,7 +268,7 @@ def test_contradictions_are_refused(cell, operations, tags, message, tmp_path):
         read(tmp_path, cif(cell, operations=operations, **tags))
 
 
-def test_what_is_stated_wrongly_beside_operations_is_reported(tmp_path):
+def test_what_is_stated_wrongly_next_to_operations_is_reported(tmp_path):
     tags = {
         "symmetry_cell_setting": "cubic",
         "exptl_crystal_density_diffrn": 2.5,

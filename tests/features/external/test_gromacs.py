@@ -63,7 +63,7 @@ def energies(folder):
 
 @needs_gmx
 @pytest.mark.parametrize("case", PLAIN)
-def test_endings(case, tmp_path):
+def test_truncations(case, tmp_path):
     system = build(small_scene(WATER, 16.0, forces={"cutoff_A": 6.0} | PLAIN[case], stages=STAGES))
     state = nudged(system)
     names = write_gromacs(tmp_path, force_field_of(system), state)
@@ -120,7 +120,7 @@ def positions(path):
 
 
 @needs_gmx
-def test_a_leaning_box(tmp_path):
+def test_a_triclinic_box(tmp_path):
     box = {"lengths_A": [16.0, 15.0, 15.5], "angles_deg": [75.0, 80.0, 100.0]}
     scene = small_scene(
         {"spce": 12, "argon": 6}, 1.0, box=box, stages=STAGES, forces={"cutoff_A": 6.0} | FINE
@@ -163,7 +163,7 @@ def test_every_stage_runs(tmp_path):
         assert (tmp_path / f"{name}.gro").exists()
 
 
-def test_what_gromacs_cannot_do_is_told_at_once(tmp_path):
+def test_what_gromacs_cannot_do_is_reported_at_once(tmp_path):
     stages = [
         {"duration_ps": 0.1, "ensemble": "nvt", "temperature_K": 300.0, "thermostat": "andersen"},
         {

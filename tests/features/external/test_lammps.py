@@ -57,7 +57,7 @@ def test_both_engines_compute_the_same(name):
 @pytest.mark.parametrize(
     "truncation", ["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
 )
-def test_every_ending_is_the_same(truncation):
+def test_every_truncation_is_the_same(truncation):
     """Each has a style of LAMMPS, or a table: then splines decide how near it comes."""
     forces = {"cutoff_A": 6.0, "truncation": truncation}
     _, _, engine, lines = both({"nitrogen": 20, "argon": 4}, {"forces": forces}, edge=13.0)
@@ -145,7 +145,7 @@ def test_states_come_back_as_they_went():
     )
 
 
-def test_chunks_are_the_whole_and_a_state_given_again_goes_on():
+def test_chunks_are_the_whole_and_a_state_given_again_continues():
     system, _, state = built({"spce": 12}, 13.0, 1, 0.1, **THERE, forces={"cutoff_A": 6.0})
     engine, row = LammpsEngine(system), None
     whole = engine.begin(state, row)
@@ -321,7 +321,7 @@ def test_a_body_has_no_other_engine(capsys, tmp_path):
     assert not (tmp_path / "x").exists()
 
 
-def test_lammps_that_is_absent_or_fails_says_so(monkeypatch, scene, tmp_path, capsys):
+def test_lammps_that_is_absent_or_fails_is_reported(monkeypatch, scene, tmp_path, capsys):
     system, _, state = built({"spce": 12}, 13.0, 1, 0.1, **THERE, forces={"cutoff_A": 6.0})
     engine = LammpsEngine(system)
     engine._fixes = ["fix bodies bodies rigid/none molecule"]
@@ -431,7 +431,7 @@ def ellipsoids(**forces):
     )
 
 
-def test_a_liquid_of_ellipsoids_beside_sites_is_the_same():
+def test_a_liquid_of_ellipsoids_next_to_sites_is_the_same():
     found = verify(ellipsoids())
     assert found.agrees, found.description()
     (gay_berne,) = [line for line in found.start if line.name == "gay berne"]

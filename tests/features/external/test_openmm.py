@@ -208,7 +208,7 @@ WAYS = [*((ending, "lorentz-berthelot") for ending in ENDINGS), ("switch", "geom
 
 
 @pytest.mark.parametrize(("truncation", "mixing"), WAYS)
-def test_endings_and_mixing(truncation, mixing):
+def test_truncations_and_mixing(truncation, mixing):
     forces = {
         "cutoff_A": 6.0,
         "truncation": truncation,
@@ -242,7 +242,7 @@ def test_damped_shifted_force():
     assert found == pytest.approx(COULOMB * pairs[near].sum(), rel=1e-9)
 
 
-def test_a_leaning_box_with_parameters_of_pairs():
+def test_a_triclinic_box_with_parameters_of_pairs():
     pairs = [{"sites": ["OW", "AR"], "sigma_A": 3.3, "epsilon_kJ_mol": 0.9}]
     box = {"lengths_A": [15.0, 14.0, 14.5], "angles_deg": [75.0, 80.0, 100.0]}
     for tensor in (True, False):
@@ -288,7 +288,7 @@ def test_pme_with_ions_and_frozen_molecules():
     agree(ours, single, state, 1e-4)
 
 
-def test_waves_of_ewald_become_a_grid():
+def test_k_vectors_of_ewald_become_a_grid():
     """OpenMM has splines of order 5: a grid of the accuracy requested takes the position of other
     orders and of k-vectors."""
     found = []
@@ -343,7 +343,7 @@ def conserved(system, engine, state):
 
 
 @pytest.mark.parametrize("kind", THERMOSTATS)
-def test_stages_repeat_go_on_and_conserve(kind):
+def test_stages_repeat_continue_and_conserve(kind):
     system, _, start = staged(kind)
     row = system.scene.stages[0].scheme
 
@@ -475,7 +475,7 @@ def test_the_folder_runs_by_itself(tmp_path):
     assert float(lines[1].split(",")[2]) == pytest.approx(expected, rel=1e-6)
 
 
-def test_what_openmm_cannot_do_is_told_at_once():
+def test_what_openmm_cannot_do_is_reported_at_once():
     stages = [
         {"duration_ps": 0.1, "ensemble": "nvt", "temperature_K": [300.0, 310.0]},
         {
@@ -520,7 +520,7 @@ def test_a_platform_that_is_not_there():
         OpenmmEngine(system, platform="Abacus")
 
 
-def test_without_openmm_one_sentence_says_what_to_install(monkeypatch):
+def test_without_openmm_one_sentence_states_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "openmm", None)
     system = build(small_scene({"spce": 4}, 13.0, **BOX))
     with pytest.raises(

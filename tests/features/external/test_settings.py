@@ -145,7 +145,7 @@ def test_gromacs_has_lengths_in_nm(tmp_path):
     ]
 
 
-def test_gromacs_places_a_site_off_the_plane_of_its_masses(tmp_path):
+def test_gromacs_has_a_site_off_the_plane_of_its_masses(tmp_path):
     """For a lone pair of TIP5P: r = r_i + a r_ij + b r_ik + c r_ij x r_ik, c in 1/nm."""
     own = drawn(NVT, counts={"tip5p": 20})
     write_gromacs(tmp_path, own, own.system.state)
@@ -439,7 +439,9 @@ def test_the_soft_core_of_a_coupling_is_refused_by_its_name(name):
         ("CPU", None, {"Threads": "3"}),
     ],
 )
-def test_a_gpu_has_mixed_precision_unless_the_scene_says_otherwise(platform, precision, properties):
+def test_a_gpu_has_mixed_precision_unless_the_scene_states_otherwise(
+    platform, precision, properties
+):
     assert engine.properties_of(platform, precision, 3) == properties
     given = {"name": "openmm", "platform": platform} | (
         {"precision": precision} if precision else {}

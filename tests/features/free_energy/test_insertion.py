@@ -323,7 +323,7 @@ def test_a_molecule_on_which_nothing_acts_is_refused():
         insertion(frames, "krypton")
 
 
-def test_a_profile_keeps_small_weights_beside_large_ones():
+def test_a_profile_keeps_small_weights_next_to_large_ones():
     """On one side of the middle the weight is 1e30 times as large."""
     height = np.tile(np.linspace(-9.9, 9.9, 400), (10, 1))
     energy = np.where(height < 0, -np.log(1e30), np.log(2.0))

@@ -136,7 +136,7 @@ def test_correlated_samples_have_larger_errors():
     assert 0.7 < np.median(errors[1] / errors[0]) < 2.0
 
 
-def test_windows_that_are_no_chain():
+def test_windows_that_are_not_a_chain():
     apart = windows(4, lennard_jones, distances=[4.0, 5.2], stiffness=60.0)
     with pytest.raises(
         OutputError, match=r"windows at 4 and 5\.2 Å have no common distances: add a window"

@@ -230,12 +230,12 @@ def test_a_text_has_the_energy_of_all_its_pairs(axis):
         ),
     ],
 )
-def test_what_is_wrong_with_a_potential_is_told(tables, message, tmp_path):
+def test_what_is_wrong_with_a_potential_is_reported(tables, message, tmp_path):
     with pytest.raises(SceneError, match=message):
         build(scene(tables))
 
 
-def test_pairs_at_a_cutoff_where_the_energy_jumps_are_no_wrong_force():
+def test_pairs_at_a_cutoff_where_the_energy_jumps_are_not_a_wrong_force():
     """Two rods at a distance of exactly the cutoff; a wrong force is found there too."""
     places = {"box": {"lengths_A": 48.0}, "molecules": [body("rod", 64)]}
     tables = GAY_BERNE | {"parameters": {"rod": ROD}, "references": {}}

@@ -36,7 +36,7 @@ def lennard_jones(p: Pair, r, inverse):
     return 4 * p.eps * (six * six - six), 24 * p.eps * (2 * six * six - six) * inverse
 
 
-def test_a_function_needs_to_say_what_its_parameters_are():
+def test_a_function_needs_to_state_what_its_parameters_are():
     def bare(p, r):
         return r, r
 
@@ -239,7 +239,7 @@ def test_parameters_may_come_from_the_model():
         ({"table": [1.0]}, "must be a file, or lists"),
     ],
 )
-def test_a_potential_that_makes_no_sense_is_told_at_once(arguments, word):
+def test_a_potential_that_makes_no_sense_is_reported_at_once(arguments, word):
     with pytest.raises(ValueError, match=word):
         rigidmd.pair_potential(**arguments)
 
@@ -288,7 +288,7 @@ def umbrella(p: Well, r):
     ("truncation", "words"),
     [("plain", "umbrella is 121 kJ/mol (49 kT at 298 K)"), ("shift", "its force is -44 kJ/mol/Å")],
 )
-def test_what_a_function_has_at_its_cutoff_is_told(function, truncation, words):
+def test_what_a_function_has_at_its_cutoff_is_reported(function, truncation, words):
     """A potential from a function is checked like a text; one that vanishes at its cutoff has no
     warning."""
     scene = small_scene(

@@ -35,7 +35,7 @@ def halve(bath, model, state, h, draw):
     state.energy_ledger[0] += (factor - 1) * before
 
 
-def test_a_thermostat_of_ones_own_takes_the_place_of_that_of_the_stage():
+def test_a_thermostat_of_a_user_replaces_that_of_the_stage():
     output = {"log_interval_ps": 0.02}
     scene = small_scene({"argon": 20}, 40.0, stages=POINTS["stages"], output=output)
     results = rigidmd.Simulation(scene, thermostat=Halving(0.01)).run()

@@ -30,7 +30,7 @@ def test_the_list_finds_every_pair_while_bodies_move_and_the_box_changes():
     assert results["volume"][-1] != results["volume"][0]
 
 
-def test_the_list_is_built_anew_where_a_strain_of_a_triclinic_cell_exceeds_its_skin():
+def test_the_list_is_rebuilt_where_a_strain_of_a_triclinic_cell_exceeds_its_skin():
     """The strain is a matrix S with cell = built S, whose norm e may be up to skin/(cutoff + skin):
     then (1 - e)(cutoff + skin) is the cutoff."""
     tables = GAY_BERNE | {"parameters": {"rod": ROD}, "references": {}}

@@ -124,7 +124,7 @@ def test_a_scene_has_a_table_as_a_file_and_compares_its_forces_at_the_start(tmp_
 
 
 @pytest.mark.parametrize(("first", "expected"), [(3.0, ""), (4.2, "bodies come nearer")])
-def test_a_table_that_keeps_no_bodies_apart_is_warned_of(first, expected, tmp_path):
+def test_a_table_that_separates_no_bodies_is_warned_of(first, expected, tmp_path):
     r, angles = np.linspace(first, 12, 30), np.linspace(0, 180, 5)
     energy = 8 * ((4 / r) ** 12 - (4 / r) ** 6)
     arrays = {name: angles for name in ("theta_1_deg", "theta_2_deg", "phi_deg")}

@@ -133,7 +133,7 @@ class Faulty(rigidmd.Force):
         ),
     ],
 )
-def test_a_faulty_force_is_told_with_its_molecule_and_step(way, word):
+def test_a_faulty_force_is_reported_with_its_molecule_and_step(way, word):
     with pytest.raises(SimulationError if way == "nan" else SceneError, match=word):
         rigidmd.Simulation(points(), forces=[Faulty(way)]).run()
 
@@ -198,7 +198,7 @@ class Halfway(Spring):
         (lambda state: 0.0, "is not a force"),
     ],
 )
-def test_a_force_that_is_not_what_its_energy_says_stops_the_run_with_the_numbers(force, word):
+def test_a_force_that_is_not_what_its_energy_states_stops_the_run_with_the_numbers(force, word):
     scene = small_scene({"spce": 8}, 20.0, forces={"electrostatics": "none"})
     with pytest.raises((SceneError, SimulationError), match=word):
         system = build(scene.with_user_code([force]))

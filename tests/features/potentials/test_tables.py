@@ -19,7 +19,7 @@ from rigidmd.units import KJ_PER_MOL
 # --- formulas -------------------------------------------------------------------------------------
 
 
-def test_a_table_is_as_good_as_it_says():
+def test_a_table_is_as_good_as_it_states():
     r = np.linspace(2.5, 10, 200)
     given = {"eps": 1.0, "sig": 3.4}
     exact = formula_of_text(LJ).radial(given)
@@ -157,7 +157,7 @@ WRONG_TABLES = {
 
 
 @pytest.mark.parametrize("text", WRONG_TABLES, ids=range(len(WRONG_TABLES)))
-def test_a_table_that_is_no_use_is_told(text, tmp_path):
+def test_a_table_that_is_useless_is_reported(text, tmp_path):
     (tmp_path / "argon.csv").write_text(text + "\n")
     with pytest.raises(SceneError, match=WRONG_TABLES[text]):
         build(tabulated(tmp_path, sites=("AR",)))
@@ -174,7 +174,7 @@ def test_a_table_that_overrides_another_may_be_anywhere(tmp_path, monkeypatch):
     assert scene.inputs == {"forces.custom.0.table": tmp_path / "argon.csv"}
 
 
-def test_all_errors_of_a_table_are_told_and_its_file_is_in_the_folder(tmp_path):
+def test_all_errors_of_a_table_are_reported_and_its_file_is_in_the_folder(tmp_path):
     (tmp_path / "argon.csv").write_text("\n".join(["1 x"] * 9) + "\n" + ROWS)
     with pytest.raises(SceneError) as refused:
         build(tabulated(tmp_path, sites=("AR",)))
@@ -213,7 +213,7 @@ def test_a_gap_in_a_table_is_refused(gap, with_forces):
 @pytest.mark.parametrize(
     ("step", "with_forces"), [(0.02, False), (0.05, True), (0.1, False), (0.1, True), (0.15, True)]
 )
-def test_the_error_of_a_spline_is_what_it_says(step, with_forces):
+def test_the_error_of_a_spline_is_what_it_states(step, with_forces):
     """Compared with the exact energy where it is below ten wells; the estimate is within a factor
     of 6."""
     formula = rigidmd.pair_potential(
@@ -236,7 +236,7 @@ def test_a_table_of_two_parts_or_of_growing_intervals_has_no_gap():
         assert rigidmd.pair_potential(table=tuple(rows)).formula(9.0).error < 1e-3
 
 
-def test_a_spline_that_is_nonsense_is_refused_and_a_poor_one_told(tmp_path):
+def test_a_spline_that_is_nonsense_is_refused_and_a_poor_one_reported(tmp_path):
     r, energy, _ = lennard_jones_rows(0.02)
     wild = energy.copy()
     wild[120] = 1e6
@@ -253,7 +253,7 @@ def test_a_spline_that_is_nonsense_is_refused_and_a_poor_one_told(tmp_path):
 
 
 @pytest.mark.parametrize("value", ["1e300", "-1e31", "1e308"])
-def test_a_huge_energy_in_a_table_is_told_with_its_line(value, tmp_path):
+def test_a_huge_energy_in_a_table_is_reported_with_its_line(value, tmp_path):
     lines = [f"{x:g} {y:g}" for x, y in zip(*lennard_jones_rows(0.1)[:2], strict=True)]
     (tmp_path / "t.csv").write_text("\n".join([lines[0], f"2.61 {value}", *lines[1:]]))
     with pytest.raises(ValueError, match=r"t.csv: line 2: 2.61 .* has a number above 1e\+30"):

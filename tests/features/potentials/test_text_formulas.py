@@ -91,7 +91,7 @@ def test_constants_become_numbers_of_the_formula_and_whole_powers_products():
         ("*".join(f"(r+{k})" for k in range(100)), "more than 200"),
     ],
 )
-def test_a_text_that_is_no_formula_is_told(energy, word):
+def test_a_text_that_is_not_a_formula_is_reported(energy, word):
     with pytest.raises(FormulaError, match=re.escape(word)):
         formula_of_text(energy)
 
@@ -107,7 +107,7 @@ def test_a_text_that_is_no_formula_is_told(energy, word):
         ("1/(r - 2)", {}, 2.0),
     ],
 )
-def test_an_energy_that_is_not_real_is_refused_where_it_is_asked_for(energy, given, r):
+def test_an_energy_that_is_not_real_is_refused_where_it_is_requested(energy, given, r):
     with pytest.raises(FormulaError, match=f"no finite real value at r = {r:g}"):
         formula_of_text(energy).radial(given)(r)
 
@@ -243,7 +243,7 @@ def with_potential(truncation="plain", cutoff=9.0, temperature=298.0, **potentia
         (with_potential(name="wca", energy="e*(s/r)**12", parameters={"e": 1.0, "s": 3.4}), None),
     ],
 )
-def test_what_a_potential_has_at_its_cutoff_is_told(scene, words):
+def test_what_a_potential_has_at_its_cutoff_is_reported(scene, words):
     warnings = build(scene).warnings
     assert (warnings == []) == (words is None)
     assert words is None or words in warnings[0]

@@ -88,7 +88,7 @@ def test_a_file_of_code_runs_only_where_it_is_trusted(tmp_path, monkeypatch, cap
         ("x = 3", {"name": "x"}, "3 is not a force"),
     ],
 )
-def test_a_file_that_is_no_use_is_told(text, entry, word, tmp_path):
+def test_a_file_that_is_useless_is_reported(text, entry, word, tmp_path):
     (tmp_path / "mine.py").write_text(text)
     rigidmd.trust(tmp_path / "mine.py")
     scene = rigidmd.Scene.from_dict(

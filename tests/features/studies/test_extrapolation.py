@@ -178,7 +178,7 @@ def test_means_of_few_runs_without_errors_are_left_out():
     assert known[1][1:] == (2.0, 1.5, 0.3)
 
 
-def test_a_value_of_runs_together_takes_the_place_of_the_mean_of_their_values():
+def test_a_value_of_runs_together_replaces_the_mean_of_their_values():
     """Squares of means, whose values in single runs are too high, or too short for a value."""
     rng, count = np.random.default_rng(5), 6
     for has_values in (True, False):

@@ -120,7 +120,7 @@ def test_a_run_that_was_moved_is_read_where_it_is(run, tmp_path):
         rigidmd.read_run(moved).universe()
 
 
-def test_a_run_that_goes_on_is_read_so_far(tmp_path):
+def test_a_run_that_continues_is_read_so_far(tmp_path):
     """Within a run, which holds its lock, and after it was killed: the results so far."""
     folder, seen = tmp_path / "run", []
 
@@ -202,7 +202,7 @@ def test_a_sweep_is_read(tmp_path):
     assert snapshot(folder) == before
 
 
-def test_what_is_no_run(tmp_path, run):
+def test_what_is_not_a_run(tmp_path, run):
     with pytest.raises(OutputError, match="is not there"):
         rigidmd.read_run(tmp_path / "nothing")
     with pytest.raises(OutputError, match="is not the folder of a run"):

@@ -42,7 +42,7 @@ def frames_in(path):
 
 @pytest.mark.parametrize("kind", ["top", "water"])
 @pytest.mark.usefixtures("reads_here")
-def test_a_film_moves(kind, request, tmp_path, capsys):
+def test_an_animation_moves(kind, request, tmp_path, capsys):
     path = tmp_path / "film.gif"
     plots = ["--plots"] if kind == "water" else []
     assert (
@@ -96,7 +96,7 @@ def test_gifs_of_the_documentation_are_small():
     assert {path.name: path.stat().st_size for path in gifs if path.stat().st_size > 500_000} == {}
 
 
-def test_a_film_needs_ffmpeg_for_mp4_only(top, tmp_path, monkeypatch, capsys):
+def test_an_animation_needs_ffmpeg_for_mp4_only(top, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(film.shutil, "which", lambda name: None)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)  # not installed
     assert film.default_name() == "film.gif"
@@ -137,13 +137,13 @@ def test_a_film_needs_ffmpeg_for_mp4_only(top, tmp_path, monkeypatch, capsys):
 @pytest.mark.skipif(
     not shutil.which("ffmpeg"), reason="ffmpeg is not installed: .mp4 is not tested"
 )
-def test_a_film_as_mp4(top, tmp_path):
+def test_an_animation_as_mp4(top, tmp_path):
     path = tmp_path / "top.mp4"
     assert cli.main(["film", str(top), "-o", str(path), "--seconds", "0.2"]) == 0
     assert path.read_bytes()[4:8] == b"ftyp"
 
 
-def test_a_film_of_a_periodic_motion_ends_where_it_began(top):
+def test_an_animation_of_a_periodic_motion_ends_where_it_began(top):
     from rigidmd.view.body_animation import BodyAnimation
 
     film = BodyAnimation(read_record(top))
@@ -164,7 +164,7 @@ def test_a_film_of_a_periodic_motion_ends_where_it_began(top):
 
 
 @pytest.mark.usefixtures("reads_here")
-def test_a_film_says_what_it_leaves_out(water, tmp_path, monkeypatch):
+def test_an_animation_states_what_it_leaves_out(water, tmp_path, monkeypatch):
     monkeypatch.setattr(molecule_animation, "chemiscope_script", lambda: "")
     monkeypatch.setattr(molecule_animation, "MOST_COORDINATES", 3 * 3 * 648)
     page = tmp_path / "water.html"
@@ -174,14 +174,14 @@ def test_a_film_says_what_it_leaves_out(water, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("seconds", "strobes"), [(0.2, True), (2.0, False)])
-def test_a_film_in_which_a_body_turns_too_far_between_frames_says_so(
+def test_an_animation_in_which_a_body_rotates_too_far_between_frames_is_reported(
     seconds, strobes, top, tmp_path
 ):
     _, told = write_film(top, tmp_path / "top.gif", seconds, height=100)
     assert any("times between two frames" in sentence for sentence in told) == strobes
 
 
-def test_a_gallery_leads_to_films(tmp_path, capsys):
+def test_a_gallery_leads_to_animations(tmp_path, capsys):
     folder = tmp_path / "gallery"
     assert cli.main(["gallery", "heavy_top_3", "-o", str(folder)]) == 0
     index = (folder / "index.html").read_text("utf-8")

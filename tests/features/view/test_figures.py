@@ -81,7 +81,7 @@ NAMES = ["$`$", "$a$ $", r"\frac{$x$", "$$", "$(x) ${v}", r"\$a$", "a_b^c", "%(x
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_texts_of_a_figure_are_no_formulas(name):
+def test_texts_of_a_figure_are_not_formulas(name):
     figure = Picture(figsize=(6, 4), layout="constrained")
     axis, other = figure.subplots(1, 2)
     figure.suptitle(name)
@@ -286,7 +286,7 @@ def test_distances_of_colours_are_those_of_cie():
 
 @pytest.mark.parametrize("viewer", VIEWERS)
 @pytest.mark.parametrize("palette", [PALETTE, DARK_PALETTE], ids=["light", "dark"])
-def test_colours_of_curves_are_told_apart_by_all(palette, viewer):
+def test_colours_of_curves_are_distinguished_by_all(palette, viewer):
     seen = {name: lab(color, viewer) for name, color in palette.items()}
     distances = {
         pair: np.linalg.norm(seen[pair[0]] - seen[pair[1]]) for pair in combinations(seen, 2)
@@ -344,7 +344,7 @@ def test_what_range_is_shown(values, stage, wanted):
     assert found == (wanted and pytest.approx(wanted))
 
 
-def test_as_many_integrators_as_there_are_are_told_apart():
+def test_as_many_integrators_as_there_are_are_distinguished():
     trial_system, _ = body_trial_system(Scene.read(ROOT / "systems" / "heavy_top_3.toml"), 0.1)
     names = [*SCHEMES, *COMPARATORS]
     trials = [

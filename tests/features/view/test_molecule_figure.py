@@ -36,7 +36,7 @@ def test_rotations_are_output(water_in_memory):
     assert np.allclose(arms - arms[:, :1], seen - seen[:, :1], atol=1e-4)
 
 
-def test_the_files_of_a_run_tell_the_same(tmp_path):
+def test_the_files_of_a_run_agree(tmp_path):
     scene = Scene.read(
         ROOT / "systems" / "water.toml", SHORT_WATER | {"output.topology": "topology.pdb"}
     )

@@ -94,7 +94,7 @@ def compiling_something(announce):
     yield
 
 
-def test_a_notebook_shows_the_bar_in_one_place(cell, capsys, monkeypatch):
+def test_a_notebook_shows_the_bar_in_one_position(cell, capsys, monkeypatch):
     monkeypatch.setattr("rigidmd.run.loop.compiling_announced", compiling_something)
     Simulation(top()).run()
     (shown,) = cell
@@ -119,7 +119,7 @@ def test_a_bar_that_ends_early_waits_for_nothing(cell):
     assert re.fullmatch(r"40 %: 40 of 100 iterations, 00:00", cell[0][-1]["text/plain"])
 
 
-def test_elsewhere_progress_is_asked_for(capsys, monkeypatch):
+def test_elsewhere_progress_is_requested(capsys, monkeypatch):
     monkeypatch.setattr("rigidmd.run.loop.compiling_announced", compiling_something)
     Simulation(top()).run()
     assert capsys.readouterr() == ("", "")
@@ -151,7 +151,7 @@ def test_a_live_plot_is_one_picture_that_changes(cell, monkeypatch):
         Simulation(top(), observers=rigidmd.LivePlot("L_x_error")).run(progress=False)
 
 
-def test_a_live_plot_does_nothing_elsewhere():
+def test_a_live_plot_has_no_effect_elsewhere():
     results = Simulation(top(), observers=rigidmd.LivePlot()).run()
     assert len(results.samples) == 101
 
@@ -322,7 +322,7 @@ def test_the_figure_of_a_run_is_its_file(tmp_path):
     assert (tmp_path / "again.png").read_bytes() == (tmp_path / "out" / "energy.png").read_bytes()
 
 
-def test_the_film_of_a_body_is_a_page_in_a_frame(tmp_path):
+def test_the_animation_of_a_body_is_a_page_in_a_frame(tmp_path):
     results = Simulation(top()).run()
     film = rigidmd.view.show(results)
     assert film.save(tmp_path / "film.html").read_text() == film.page
@@ -344,7 +344,7 @@ def shifted(simulation):
 
 
 @pytest.mark.usefixtures("reads_here")
-def test_the_film_of_molecules_is_a_page_in_a_frame(tmp_path):
+def test_the_animation_of_molecules_is_a_page_in_a_frame(tmp_path):
     pytest.importorskip("chemiscope", reason="chemiscope is not installed")
     memory, files = (shifted(argon(folder)).run() for folder in (None, tmp_path / "out"))
     place = []
@@ -361,7 +361,7 @@ def test_the_film_of_molecules_is_a_page_in_a_frame(tmp_path):
     assert place[0] == pytest.approx(place[1], abs=0.012)  # a .xtc has hundredths of Å
 
 
-def test_without_chemiscope_one_sentence_says_so(monkeypatch):
+def test_without_chemiscope_one_sentence_reports_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "chemiscope", None)
     with pytest.raises(ImportError, match=r"needs chemiscope: pip install chemiscope"):
         rigidmd.view.show(argon().run())
@@ -432,7 +432,7 @@ def test_the_tutorial_runs(tmp_path):
 
 
 @pytest.mark.soak
-def test_the_tutorial_shows_what_it_says(tmp_path):
+def test_the_tutorial_shows_what_it_states(tmp_path):
     shown = shown_by(executed(tmp_path))
     told = "".join(bundle["text/plain"] for bundle in shown)
     peak, error = map(float, re.search(r"first peak: ([\d.]+) ± ([\d.]+) Å", told).groups())

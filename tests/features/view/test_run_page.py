@@ -54,7 +54,7 @@ def shown(page, out, at=None, size="420,700"):
     return imread(out)[:, :, :3]
 
 
-def test_a_report_tells_of_molecules(water, tmp_path, capsys):
+def test_a_report_describes_molecules(water, tmp_path, capsys):
     page = tmp_path / "water.html"
     assert cli.main(["report", str(water), "-o", str(page)]) == 0
     text = page.read_text("utf-8")
@@ -83,7 +83,7 @@ def test_a_report_tells_of_molecules(water, tmp_path, capsys):
     assert str(page) in capsys.readouterr().out
 
 
-def test_a_report_tells_of_a_body(top, capsys):
+def test_a_report_describes_a_body(top, capsys):
     assert cli.main(["report", str(top)]) == 0  # next to the run, and again
     assert cli.main(["report", str(top)]) == 0
     text = (top / "report.html").read_text("utf-8")
@@ -93,7 +93,7 @@ def test_a_report_tells_of_a_body(top, capsys):
     assert "report.html" in (top / ".rigidmd-run").read_text()  # which a new run there removes
 
 
-def test_the_film_of_a_body_is_its_motion(top, tmp_path):
+def test_the_animation_of_a_body_is_its_motion(top, tmp_path):
     page = tmp_path / "top.html"
     assert cli.main(["view", str(top), "-o", str(page)]) == 0
     data, seen = data_of(page), read_record(top).columns
@@ -109,7 +109,7 @@ def test_the_film_of_a_body_is_its_motion(top, tmp_path):
 
 
 @pytest.mark.usefixtures("reads_here")
-def test_the_film_of_molecules_is_their_trajectory(water, tmp_path, monkeypatch):
+def test_the_animation_of_molecules_is_their_trajectory(water, tmp_path, monkeypatch):
     monkeypatch.setattr(molecule_animation, "chemiscope_script", lambda: "var Chemiscope;")
     page = tmp_path / "water.html"
     assert cli.main(["view", str(water), "-o", str(page)]) == 0
@@ -156,7 +156,7 @@ def test_every_format_of_a_trajectory_has_a_page(extension, tmp_path):
 
 
 @pytest.mark.usefixtures("reads_here")
-def test_without_chemiscope_a_sentence_says_what_to_install(water, monkeypatch, capsys):
+def test_without_chemiscope_a_sentence_states_what_to_install(water, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "chemiscope", None)
     assert cli.main(["view", str(water)]) == 2
     assert capsys.readouterr().err.strip().endswith("needs chemiscope: pip install chemiscope")
@@ -190,7 +190,7 @@ def test_a_browser_shows_water_that_moves(water, tmp_path):
 
 @in_browser
 @pytest.mark.soak
-def test_a_film_of_a_thousand_frames_of_water(tmp_path):
+def test_an_animation_of_a_thousand_frames_of_water(tmp_path):
     pytest.importorskip("chemiscope", reason="chemiscope is not installed")
     more = SHORT_WATER | {
         "stages.production.duration_ps": 2.0,
@@ -234,7 +234,7 @@ def test_time_axes_of_plots_are_aligned(run, request):
     assert all(0 < float(top) < float(bottom) < 1 for _, _, top, bottom in boxes)
 
 
-def test_notes_that_a_page_has_elsewhere_are_no_warnings(water, tmp_path):
+def test_notes_that_a_page_has_elsewhere_are_not_warnings(water, tmp_path):
     write_report(water, tmp_path / "page.html")
     text = (tmp_path / "page.html").read_text("utf-8")
     assert text.count("pme: alpha") == 1  # in the description of the system
@@ -251,7 +251,7 @@ def test_notes_that_a_page_has_elsewhere_are_no_warnings(water, tmp_path):
         ("no log", "log.csv cannot be read"),
     ],
 )
-def test_a_folder_that_is_no_run(command, fault, said, water, tmp_path, capsys):
+def test_a_folder_that_is_not_a_run(command, fault, said, water, tmp_path, capsys):
     folder = tmp_path / "run"
     if fault == "a file":
         folder.write_text("x")
@@ -331,7 +331,7 @@ def test_a_body_that_was_killed_shows_its_last_checkpoint(top, tmp_path, capsys)
     assert np.array_equal(read_record(folder).columns["q11"], whole)
 
 
-def test_a_page_is_not_replaced_unless_asked(top, tmp_path, capsys):
+def test_a_page_is_not_replaced_unless_requested(top, tmp_path, capsys):
     page = tmp_path / "page.html"
     page.write_text("mine")
     assert cli.main(["report", str(top), "-o", str(page)]) == 2

@@ -33,7 +33,7 @@ from rigidmd.units import BAR
         ),
     ],
 )
-def test_lennard_jones_and_real_space_end_apart(truncation, ewald):
+def test_lennard_jones_and_real_space_end_at_different_distances(truncation, ewald):
     """RASPA's sums have the one shifted and the other plain."""
     cutoff, alpha = 6.0, 0.3
     forces = {

@@ -346,7 +346,7 @@ def test_k_vectors_of_a_cell_that_a_file_describes_otherwise(tmp_path):
     assert any("grid 20 x 20 x 20" in note for note in build(Scene.from_dict(data, tmp_path)).notes)
 
 
-def test_a_cell_described_anew_is_said_by_every_command(tmp_path, capsys):
+def test_a_cell_described_again_is_reported_by_every_command(tmp_path, capsys):
     (tmp_path / "triclinic.toml").write_text("""
 [box]
 lengths_A = 36

@@ -142,7 +142,7 @@ def test_forces_torques_and_virial_are_slopes_of_the_energy(forces, box):
         for a, m in product([1e-3, 1e-5], ["ewald", "pme"])
     ],
 )
-def test_forces_are_as_accurate_as_asked_for(asked, method, box):
+def test_forces_are_as_accurate_as_requested(asked, method, box):
     """Within a factor 2, relative to 24 epsilon/sigma, with molecules of one site each; as the note
     states."""
     box = [
@@ -172,7 +172,7 @@ def test_forces_are_as_accurate_as_asked_for(asked, method, box):
     "box",
     [{"lengths_A": 18.0}, {"lengths_A": 40.0}, {"lengths_A": [18.0, 17.0, 16.0], "vacuum_A": 30.0}],
 )
-def test_the_note_has_the_error_that_was_asked_for(asked, box):
+def test_the_note_has_the_error_that_was_requested(asked, box):
     """In a liquid, in a dilute box, of which a part is filled, and in a slab."""
     forces = {
         "cutoff_A": 7.9,
@@ -361,7 +361,7 @@ def test_settings_that_make_no_sense(forces, words):
         )
 
 
-def test_what_is_refused_says_so():
+def test_what_is_refused_is_reported():
     forces = {"cutoff_A": 8.0, "truncation": "shift", "dispersion": "pme"}
     with pytest.raises(SceneError, match="needs a periodic box"):
         build(small_scene({"argon": 3}, None, forces=forces))

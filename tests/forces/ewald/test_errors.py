@@ -25,7 +25,7 @@ from rigidmd.units import COULOMB
         ),
     ],
 )
-def test_forces_are_as_accurate_as_asked_for(method, asked):
+def test_forces_are_as_accurate_as_requested(method, asked):
     """Measured against a tight Ewald sum: within a factor 2 of the request, either way; and as
     estimated."""
     forces = {"cutoff_A": 7.7, "electrostatics": method, "ewald_accuracy": asked}
@@ -46,7 +46,7 @@ def test_forces_are_as_accurate_as_asked_for(method, asked):
     ("asked", "method"),
     [(1e-4, "pme"), (1e-5, "ewald"), pytest.param(1e-6, "pme", marks=pytest.mark.soak)],
 )
-def test_forces_of_a_slab_are_as_accurate_as_asked_for(method, asked):
+def test_forces_of_a_slab_are_as_accurate_as_requested(method, asked):
     """The density of the liquid counts, not the mean of the box: also of one that has grown along
     its normal."""
     box = {"lengths_A": [12.5, 12.5, 12.5], "vacuum_A": 37.5}

@@ -315,19 +315,19 @@ def test_settings_that_make_no_sense(forces, words):
         ("damped_shifted_force", "needs a cutoff. Give forces.cutoff_A"),
     ],
 )
-def test_what_needs_a_box_or_a_cut_off_says_so(method, words):
+def test_what_needs_a_box_or_a_cutoff_is_reported(method, words):
     with pytest.raises(SceneError, match=words):
         build(small_scene({"spce": 3}, None, forces={"electrostatics": method}))
 
 
-def test_a_charged_box_is_said_and_has_no_dipole():
+def test_a_charged_box_is_reported_and_has_no_dipole():
     system, _, _ = salty(TIGHT_EWALD)
     assert any("net charge of +6 e" in note for note in system.notes)
     with pytest.raises(SceneError, match="the dipole of a box with a net charge is not defined"):
         salty(TIGHT_EWALD, ewald_surface_permittivity=2.0)
 
 
-def test_check_says_how_and_what_is_left_out():
+def test_check_states_how_and_what_is_left_out():
     water = {"cutoff_A": 6.0, "electrostatics": "pme", "ewald_accuracy": 1e-4}
     text = describe(small_scene({"spce": 20}, 13.0, forces=water))
     assert "splines of order" in text and "estimated rms error of the force on a site" in text

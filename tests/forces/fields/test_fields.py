@@ -228,7 +228,7 @@ def test_what_is_frozen_is_left_alone():
     assert tallies["gravity"].energy != 0
 
 
-def test_check_tells_of_fields_and_of_what_is_left_out():
+def test_check_describes_fields_and_what_is_left_out():
     text = describe(slit(OSCILLATING | {"gravity_m_s2": [0.0, 0.0, -9.81]}))
     assert (
         "electric field: (0.3, -0.2, 0.6) V/nm cos(2 pi f t + 40°), f = 2.5/ps. Its work is in the energy ledger"
@@ -393,13 +393,13 @@ SOFT = {"axis": "z", "kind": "harmonic", "positions_A": [0.0, 20.0], "stiffness_
         ),
     ],
 )
-def test_what_cannot_be_is_refused_in_words(fields, more, message):
+def test_what_cannot_be_is_refused_with_a_message(fields, more, message):
     with pytest.raises(SceneError) as refused:
         build(small_scene({"spce": 5}, 30.0, fields=fields, **more))
     assert message in str(refused.value)
 
 
-def test_fields_that_are_tied_to_places_say_so():
+def test_fields_that_are_tied_to_positions_are_reported():
     def scene(fields):
         return small_scene({"spce": 4}, 36.0, fields=fields)
 

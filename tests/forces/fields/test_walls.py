@@ -14,7 +14,7 @@ from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Simulation
 
 
-def test_walls_are_what_their_formulas_say():
+def test_walls_are_what_their_formulas_state():
     def energy(z, **more):
         _, engine, state = alone({"bead": 1}, walls("lj93", **more))
         state.position[:] = [[1e3, -50.0, z]]
@@ -39,7 +39,7 @@ def test_walls_are_what_their_formulas_say():
     assert load.force[:, 2].tolist() == pytest.approx([250, 0, -1000])
 
 
-def test_a_site_behind_a_wall_is_an_error_that_says_where():
+def test_a_site_behind_a_wall_is_an_error_that_states_where():
     _, engine, state = alone({"bead": 3}, walls("lj93"))
     for z in (-4.0, -4.2):
         state.position[1, 2] = z

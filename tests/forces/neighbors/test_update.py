@@ -28,7 +28,7 @@ def energies(engine, state):
 
 
 @pytest.mark.parametrize("precision", ["double", "mixed"])
-def test_a_list_with_little_room_grows_and_misses_nothing(precision):
+def test_a_list_with_little_memory_grows_and_misses_nothing(precision):
     _, engine, state = built({"spce": 40}, 18.0, 4, forces={"cutoff_A": 8.0}, precision=precision)
     expected = energies(engine, state)
     cramped = []
@@ -54,7 +54,7 @@ def test_a_list_with_little_room_grows_and_misses_nothing(precision):
 
 
 @pytest.mark.parametrize("edge", [31.1, None])
-def test_lists_begin_with_about_the_room_they_need(edge):
+def test_lists_begin_with_about_the_memory_they_need(edge):
     _, engine, state = built({"spce": 1000 if edge else 300}, edge, 5)
     begun = [own.pairs for own in engine.new_workspaces(state)]
     others = [own.sums.forces_behind.shape[1] for own in engine.new_workspaces(state)]
@@ -83,7 +83,7 @@ def test_a_cutoff_within_which_are_too_many_sites_is_refused():
 
 @pytest.mark.parametrize("at", [(0, 0), (2, 2), (1, 0), (2, 1)])
 @pytest.mark.parametrize("counts", [{"argon": 60}, {"spce": 60}])
-def test_a_box_that_is_no_number_is_told(counts, at):
+def test_a_box_that_is_not_a_number_is_reported(counts, at):
     _, engine, state = built(counts, 20.0, 3, spread=0.05)
     engine.evaluate(state)
     state.cell[at] = np.nan
@@ -126,7 +126,7 @@ def test_a_list_serves_while_the_box_changes_little(angles, precision):
         assert np.array_equal(own.built, state.cell)
 
 
-def test_a_cell_that_becomes_too_small_for_the_cut_off_stops_in_words():
+def test_a_cell_that_becomes_too_small_for_the_cutoff_stops_with_a_message():
     _, engine, state = built(
         {"argon": 100}, 14.0, 3, spread=0.1, forces={"cutoff_A": 6.9, "skin_A": 6.0}
     )
@@ -142,7 +142,7 @@ def test_a_cell_that_becomes_too_small_for_the_cut_off_stops_in_words():
         engine.evaluate(state)
 
 
-def test_the_list_is_rebuilt_for_moves_and_for_turns():
+def test_the_list_is_rebuilt_for_moves_and_for_rotations():
     system, engine, state = built({"spce": 30}, 16.0, 6, forces={"cutoff_A": 7.0, "skin_A": 0.8})
     oracle = Oracle(system)
     rng = np.random.default_rng(0)
@@ -175,7 +175,7 @@ def test_a_list_lasts_until_sites_have_moved_by_half_its_skin():
     assert abs(expected) > 1.001 * abs(alone)
 
 
-def test_a_list_for_places_ahead_serves_longer_and_misses_nothing():
+def test_a_list_for_positions_ahead_serves_longer_and_misses_nothing():
     """Forward and back in time."""
     forces = {"cutoff_A": 7.0, "skin_A": 1.2, "truncation": "force_shift"}
     system, engine, state = built({"spce": 150, "nitrogen": 20}, 20.0, 3, spread=0.1, forces=forces)
@@ -207,7 +207,7 @@ def places_ahead(sites, state, lead, places):
             places[i, k] = x
 
 
-def test_places_ahead_are_where_velocities_lead_and_molecules_stay_rigid():
+def test_positions_ahead_are_where_velocities_lead_and_molecules_stay_rigid():
     """Over a short time to second order, and after a rotation of more than a radian."""
     system, _, state = built({"spce": 20, "nitrogen": 10}, 20.0, 3)
     sites = system.terms["coulomb"].sites
@@ -235,7 +235,7 @@ def test_places_ahead_are_where_velocities_lead_and_molecules_stay_rigid():
 
 
 @pytest.mark.parametrize("change", ["lately", "long ago", "fast", "unknown"])
-def test_a_list_is_built_for_the_present_where_places_ahead_are_too_far(change):
+def test_a_list_is_built_for_the_present_where_positions_ahead_are_too_far(change):
     """Where they are not, bodies rotate by more than 0.3 rad on the way, and sites of a molecule keep
     their distances."""
     forces = {"cutoff_A": 6.0, "skin_A": 4.0}

@@ -61,7 +61,7 @@ def screened_force(alpha, r):
 
 @pytest.mark.parametrize("x", [1.0, 2.0, 2.77, 3.1, 4.0, 5.0])
 @pytest.mark.parametrize("cutoff", [6.0, 9.0, 12.3])
-def test_a_table_is_as_accurate_as_it_says(x, cutoff):
+def test_a_table_is_as_accurate_as_it_states(x, cutoff):
     """Every interval in single precision, up to the largest r² below the cutoff."""
     alpha = x / cutoff
     density, table, off = force_table(alpha, cutoff)

@@ -56,7 +56,7 @@ def test_errors_fall_with_the_order_at_equal_cost(top):
     assert min(trial.rotation_error for trial in trials(top, "srkn_6")) < 100 * top.reference_error
 
 
-def test_every_trial_is_timed_as_often_as_asked(top):
+def test_every_trial_is_timed_as_often_as_requested(top):
     for trial in top.trials:
         assert len(trial.seconds) == 3
         assert trial.time == sorted(trial.seconds)[1]
@@ -134,7 +134,7 @@ def test_advice_comes_first_names_its_span_and_is_one_line_for_all_errors_that_a
     assert [line.startswith("for an error of Q") for line in said[2:5]] == [True, True, False]
 
 
-def test_energy_without_a_rotation_is_no_accuracy():
+def test_energy_without_a_rotation_is_not_an_accuracy():
     """A solver that keeps the energy while Q becomes no rotation, or another invariant changes, is
     not advised for it."""
     found = made(
@@ -179,7 +179,7 @@ def test_no_advantage_is_claimed_within_the_spread_of_the_timings(slow, fast):
     assert ("Equally fast within timing noise: velocity_verlet at 0.001 s" in line) != fast
 
 
-def test_mixed_precision_says_what_its_forces_lose():
+def test_mixed_precision_states_what_its_forces_lose():
     scene = small_scene({"spce": 60}, 18.5, precision="mixed")
     found = measure_accuracy(scene, ["velocity_verlet"], [2.0], span=0.01, repeats=1)
     force, torque = found.trial_system.rounding
@@ -277,7 +277,7 @@ def test_arguments_are_refused_before_anything_is_compiled_or_run(
     assert "compiling" not in said.out + said.err
 
 
-def test_comparators_stand_beside_the_schemes_and_fail_in_words():
+def test_comparators_stand_next_to_the_schemes_and_fail_with_a_message():
     upright = tomllib.loads(TOP.read_text()) | {
         "start": {"angular_velocity_body_rad_s": [3.0, 0.0, 60.0]}
     }
@@ -349,7 +349,7 @@ def test_textbook_solvers_in_all_formulations_are_measured_by_default(planned):
     )
 
 
-def test_what_cannot_be_measured_is_left_out_in_words(planned):
+def test_what_cannot_be_measured_is_left_out_with_a_message(planned):
     upright = tomllib.loads(TOP.read_text()) | {
         "start": {"angular_velocity_body_rad_s": [3.0, 0.0, 60.0]}
     }

@@ -75,7 +75,7 @@ def oscillators():
 
 
 @pytest.mark.soak
-def test_averages_of_oscillators_are_off_by_what_theory_says(oscillators):
+def test_averages_of_oscillators_are_off_by_what_theory_states(oscillators):
     thermal, freedom = 0.0083144626 * 300, 3
     quantities = {quantity.name: quantity for quantity in oscillators.quantities}
     for run in oscillators.runs:
@@ -94,7 +94,7 @@ def test_averages_of_oscillators_are_off_by_what_theory_says(oscillators):
 
 
 @pytest.mark.soak
-def test_what_is_said_of_averages_follows_from_them(oscillators):
+def test_what_is_reported_of_averages_follows_from_them(oscillators):
     quantities = {quantity.name: quantity for quantity in oscillators.quantities}
     assert {quantity.name for quantity in oscillators.main} == {"U", "T_trans", "pressure"}
     assert "Kinetic Energy (kJ/mole)" in quantities
@@ -139,7 +139,7 @@ def test_averages_leave_out_what_comes_before_equilibrium():
         )
 
 
-def test_averages_are_written_and_what_fails_is_said(tmp_path, capsys, monkeypatch):
+def test_averages_are_written_and_what_fails_is_reported(tmp_path, capsys, monkeypatch):
     stage = {
         "ensemble": "npt",
         "temperature_K": 90.0,

@@ -47,7 +47,7 @@ def test_noise_of_errors_is_the_error_of_an_order():
     assert 0.2 < np.median(np.abs(pulls)) < 1.5
 
 
-def test_an_error_of_a_trajectory_below_that_of_the_reference_is_no_order():
+def test_an_error_of_a_trajectory_below_that_of_the_reference_is_not_an_order():
     found = made(
         *[("srkn_4", 2e-3 * 0.5**k, (1.0,), error) for k, error in enumerate(FOURTH)], span=2e-2
     )

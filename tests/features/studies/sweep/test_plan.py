@@ -168,7 +168,7 @@ def test_bad_input(arguments, expected, argon, tmp_path, printed):
     assert not (tmp_path / "sweep").exists()
 
 
-def test_all_faults_of_all_points_at_once(argon, tmp_path, printed):
+def test_all_errors_of_all_points_at_once(argon, tmp_path, printed):
     arguments = [
         "--set",
         "start.temperature_K=-5,100,cold",

@@ -180,7 +180,7 @@ def test_points_end_with_their_sweep(argon, tmp_path):
     assert not list(folder.glob(".points-*"))
 
 
-def test_points_that_fail_are_told_and_repeated(argon, tmp_path, capsys):
+def test_points_that_fail_are_reported_and_repeated(argon, tmp_path, capsys):
     """A time step that is far too long ends a run."""
     folder = tmp_path / "sweep"
     arguments = [
@@ -243,7 +243,7 @@ def test_a_scene_that_changes_meanwhile_is_not_run(argon, tmp_path):
 
 
 @pytest.mark.soak
-def test_a_sweep_that_is_killed_goes_on(argon, tmp_path):
+def test_a_sweep_that_is_killed_continues(argon, tmp_path):
     """3 temperatures, 8 seeds, two at a time; the sweep is killed in the middle."""
     arguments = [
         str(argon),

@@ -17,7 +17,7 @@ from rigidmd.studies.sweep.table import SweepRow, summarise_run
 from rigidmd.studies.sweep.table import Table as SweepTable
 
 
-def test_the_energy_of_a_molecule_has_its_share_of_the_error(finished):
+def test_the_energy_of_a_molecule_has_its_fraction_of_the_error(finished):
     """For a longer run, whose energies forget themselves from one sample to the next."""
     record = read_record(finished / "temperature_K=90_seed=1")
     columns = {name: np.resize(values, 40) for name, values in record.columns.items()}
