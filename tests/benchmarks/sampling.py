@@ -31,13 +31,14 @@ import resource
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from command_line import SMOKE, new_parser, read_options
+from command_line import SMOKE, choice, new_parser, numbers, read_options
 from matplotlib.figure import Figure
 from peer_engines import (
     ENGINES,
@@ -172,11 +173,20 @@ class Run(NamedTuple):
         return folder / f"{self.ensemble}-{name}-{self.step:g}fs-{self.round}.json"
 
 
-def runs(rounds: int) -> list[Run]:
-    """All runs, round by round, of the engines that are installed."""
+ENSEMBLES = ("nvt", "npt")
+
+
+def runs(
+    rounds: int,
+    methods: Sequence[str] = tuple(METHODS),
+    ensembles: Sequence[str] = ENSEMBLES,
+    chosen: Sequence[float] | None = None,
+) -> list[Run]:
+    """All runs, round by round, of the engines that are installed; chosen : steps, all by default"""
     found = []
-    for number, ensemble in product(range(rounds), ("nvt", "npt")):
-        for name, method in METHODS.items():
+    for number, ensemble in product(range(rounds), ensembles):
+        for name in methods:
+            method = METHODS[name]
             if method.engine not in installed():
                 continue
             steps = method.steps if ensemble == "nvt" else method.dense
@@ -184,7 +194,7 @@ def runs(rounds: int) -> list[Run]:
             found += [
                 Run(ensemble, name, step, number)
                 for step in steps
-                if step > RARE or number % STARTS == 0
+                if (step > RARE or number % STARTS == 0) and (chosen is None or step in chosen)
             ]
     return found
 
@@ -446,9 +456,9 @@ def do(run: Run, folder: Path) -> None:
     run.file(folder).write_text(json.dumps(found) + "\n")
 
 
-def do_next(folder: Path, rounds: int) -> bool:
+def do_next(folder: Path, wanted: list[Run]) -> bool:
     """The next run that no one has begun; False if there is none."""
-    for run in runs(rounds):
+    for run in wanted:
         claim = run.file(folder).with_suffix(".begun")
         if run.file(folder).exists():
             continue
@@ -664,6 +674,13 @@ def main() -> None:
     parser = new_parser(__doc__)
     parser.add_argument("--rounds", type=int, default=4)
     parser.add_argument(
+        "--methods", type=choice(METHODS), default=list(METHODS), help=f"of {', '.join(METHODS)}"
+    )
+    parser.add_argument(
+        "--ensembles", type=choice(ENSEMBLES), default=list(ENSEMBLES), help="nvt,npt"
+    )
+    parser.add_argument("--steps", type=numbers(float), help="of those of each method, fs; all")
+    parser.add_argument(
         "--next", type=int, metavar="N", help="do N runs; exit status 1 if none is left"
     )
     parser.add_argument("--collect", action="store_true", help="run nothing")
@@ -671,9 +688,10 @@ def main() -> None:
     folder = options.to
     if not options.collect and not (folder / f"start{STARTS - 1}" / "sites.npz").exists():
         make_starts(folder)
+    wanted = runs(options.rounds, options.methods, options.ensembles, options.steps)
     if options.next:
-        sys.exit(0 if any([do_next(folder, options.rounds) for _ in range(options.next)]) else 1)
-    while not options.collect and do_next(folder, options.rounds):
+        sys.exit(0 if any([do_next(folder, wanted) for _ in range(options.next)]) else 1)
+    while not options.collect and do_next(folder, wanted):
         pass
     found = read(folder)
     there = {ensemble for ensemble, _, _ in found}
