@@ -4,9 +4,12 @@ manual, no link is dead.
 A comment before a block shows this file how to treat it:
 
     <!-- test: file NAME -->       the block is the file NAME, which later commands use
-    <!-- test: with OPTIONS -->    OPTIONS are added to each `rigidmd run`, `accuracy` and `sweep` of the block, and those
-                                   of --set to each `Scene.read` of a Python block: shorter runs
-    <!-- test: not run, WHY -->    commands are parsed, and their scenes read, but not run
+    <!-- test: end of NAME -->     it is added to the file NAME
+    <!-- test: with OPTIONS -->    OPTIONS are added to each command of the block that runs a scene (those in LONG), and
+                                   those of --set to each `Scene.read` of a Python block: shorter runs. KEY=VALUE alone
+                                   is added to each `rigidmd analyse`
+    <!-- test: not run, WHY -->    commands are parsed, and their scenes read, but not run. Commands with the same options
+                                   run elsewhere: on another page, or in a test of ELSEWHERE
     <!-- test: output of CMD -->   every line of the block is in the output of CMD, in this order. CMD runs with the options
                                    of the document where it is one of its commands, else as it
                                    stands
@@ -59,6 +62,17 @@ DOCUMENTS = [README, *PAGES.values()]
 MANUAL = "\n".join(
     path.read_text(encoding="utf-8") for path in PAGES.values() if path.parent.name == "reference"
 )
+#: Commands that run scenes, for which pages have shorter forms.
+LONG = ("run", "accuracy", "sweep", "virial", "stability")
+#: Commands, and options of commands, that no page runs, and the test that does.
+ELSEWHERE = {
+    "compare": "test_a_body_goes_on",
+    "resume": "test_a_body_goes_on",
+    "--repeats": "test_the_smallest_form_runs_and_leaves_the_checkout_alone",
+    "--scheduler": "test_points_run_on_a_cluster_of_dask",
+    "--to": "test_a_script_for_slurm",
+    "--collect": "test_a_script_for_slurm",
+}
 LANGUAGES = {"sh", "python", "toml", "text", "bibtex"}
 MINIMAL = {
     MolecularScene: {
@@ -139,6 +153,19 @@ def pattern_of(quoted: str, like: bool) -> re.Pattern:
     return re.compile("".join(map(form, parts)) + (".*" if like else r"\s*"))
 
 
+def changed(arguments: list[str], options: list[str]) -> list[str]:
+    """Arguments with further options. Those of --set replace values of the same keys."""
+    new = {word.partition("=")[0] for word in options}
+    pairs = list(zip(arguments, [*arguments[1:], ""], strict=True))
+    old = [
+        k
+        for k, (word, value) in enumerate(pairs)
+        if word == "--set" and value.partition("=")[0] in new
+    ]
+    left = [word for k, word in enumerate(arguments) if k not in old and k - 1 not in old]
+    return [*left, *options]
+
+
 class Reader:
     """Does what a document shows its reader to do, in the working directory."""
 
@@ -149,12 +176,15 @@ class Reader:
 
     def follow(self, block: Block) -> None:
         how, _, rest = block.told.partition(" ")
-        assert how in ("", "file", "with", "not", "output", "recorded"), block.told
+        assert how in ("", "file", "with", "end", "not", "output", "recorded"), block.told
         assert block.told or block.language != "text" or "±" not in block.text, (
             "quoted output must have its command"
         )
         if how == "file":
             Path(rest).write_text(block.text + "\n", encoding="utf-8")
+        if how == "end":
+            name = rest.removeprefix("of ")
+            Path(name).write_text(f"{Path(name).read_text()}\n{block.text}\n", encoding="utf-8")
         options = shlex.split(rest) if how == "with" else []
         if block.language == "sh":
             for words in commands_of(block.text):
@@ -182,18 +212,22 @@ class Reader:
 
     def command(self, words: list[str], options: list[str], runs: bool) -> None:
         given = shlex.join(words)
+        alone = options if options and not options[0].startswith("-") else []
         match words:
             case ["rigidmd", *arguments]:
-                if arguments[0] in ("run", "accuracy", "sweep"):
-                    arguments += options
+                to = Path(arguments[arguments.index(">") + 1]) if ">" in arguments else None
+                arguments = arguments[: arguments.index(">")] if to else arguments
+                if arguments[0] in LONG and not alone:
+                    arguments = changed(arguments, options)
+                if arguments[0] == "analyse":
+                    arguments += alone
                 if arguments[0] == "film":
                     arguments += ["--seconds", "0.3"]
-                to = Path(arguments[arguments.index(">") + 1]) if ">" in arguments else None
-                parse(arguments := arguments[: arguments.index(">")] if to else arguments)
+                parse(arguments)
                 if runs:
                     code = cli.main(arguments)
                     said = self.capsys.readouterr()
-                    assert code == 0, said.err
+                    assert code == 0, said.err or said.out
                     self.printed[given] = said.out
                     if to is not None:
                         to.write_text(said.out)
@@ -307,6 +341,27 @@ def test_what_a_document_describes_can_be_done(
         own = {f"{name} (kJ/mole)" for name in names}
         header = ["NAME (kJ/mole)" if column in own else column for column in header]
         assert {_first_of_its_kind(column) for column in header} <= named
+
+
+def form_of(words: list[str]) -> tuple[str, ...]:
+    """A command and its options, without their values."""
+    return (words[1], *sorted({word for word in words if re.match(r"--?[a-z]", word)}))
+
+
+def test_every_command_on_a_page_runs():
+    """Where it stands; or on another page with the same options, in a test of its own, or in .ci/run."""
+    runs, others = set(), {}
+    for document in DOCUMENTS:
+        for block in (block for block in blocks_of(document) if block.language == "sh"):
+            for words in (words for words in commands_of(block.text) if words[:1] == ["rigidmd"]):
+                if block.told.startswith("not run"):
+                    others[form_of(words)] = f"{document.name}:{block.line}"
+                else:
+                    runs.add(form_of(words))
+    lacking = {shlex.join(form): others[form] for form in others.keys() - runs}
+    assert {form for form in lacking if not ELSEWHERE.keys() & set(form.split())} == set(), lacking
+    tests = "".join(path.read_text("utf-8") for path in (ROOT / "tests").rglob("test_*.py"))
+    assert all(f"def {name}(" in tests for name in ELSEWHERE.values())
 
 
 def _first_of_its_kind(column: str) -> str:
@@ -530,6 +585,20 @@ def test_author_and_version_are_the_same_wherever_they_stand():
     zenodo = json.loads((ROOT / ".zenodo.json").read_text(encoding="utf-8"))
     found = [zenodo[key] for key in ("version", "keywords", "license", "creators")]
     assert found == [version, project["keywords"], project["license"], [{"name": author["name"]}]]
+
+
+def test_the_conda_recipe_has_the_version_and_requirements_of_the_package():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    recipe = (ROOT / ".ci" / "conda" / "recipe.yaml").read_text(encoding="utf-8")
+    versions = dict(re.findall(r'^  (version|python_min): "(.*)"$', recipe, re.MULTILINE))
+    metadata = project["project"]
+    python = metadata["requires-python"].removeprefix(">=")
+    assert versions == {"version": metadata["version"], "python_min": python}
+    named = {re.sub(r"(?=[<>=])", " ", text, count=1).lower() for text in metadata["dependencies"]}
+    named = {text for text in named if ";" not in text} | set(project["build-system"]["requires"])
+    listed = re.findall(r"^    - ([\w-]+ ?[<>=][^$]*?)$", recipe, re.MULTILINE)
+    listed = {text.replace("matplotlib-base", "matplotlib") for text in listed}
+    assert listed == {text.replace("hatchling>", "hatchling >") for text in named}
 
 
 def test_help_lists_and_prints_the_chapters(capsys):

@@ -148,22 +148,30 @@ TIERS = {
             for page in (
                 "analysis",
                 "body_pairs",
+                "calculators",
                 "chemical_potential",
                 "crystals",
+                "engines",
                 "ensembles",
                 "extending",
+                "fast",
                 "five_minutes",
                 "mixtures",
                 "molecule",
                 "normal_modes",
                 "npt",
                 "pictures",
+                "pmf",
                 "python",
                 "resume",
+                "robustness",
                 "slab",
                 "studies",
                 "tables",
+                "time_step",
+                "time_step_water",
                 "top",
+                "transport",
                 "water",
             )
         ),
@@ -214,7 +222,7 @@ TIERS = {
             "a_liquid_of_ellipsoids_next_to_sites_is_the_same",
             "a_run_is_one_like_any_other[1]",
         ),
-        "features/view/test_notebook.py": ("a_sweep_shows_its_progress",),
+        "features/view/test_notebook.py": ("a_sweep_shows_its_progress", "the_tutorial_runs"),
         "engines/cpu/test_engine.py": (
             "an_observation_takes_the_energies_of_the_last_step[stochastic_cell*",
             "an_observation_takes_the_energies_of_the_last_step[srkn_6*",
@@ -268,6 +276,9 @@ TIERS = {
             "a_table_in_a_file_is_the_potential_that_it_lists*",
         ),
         "features/potentials/test_text_formulas.py": ("any_text_is_read_or_refused_soon",),
+        "features/potentials/test_user_code.py": (
+            "every_example_of_an_extension_runs_and_is_short*",
+        ),
         "features/view/test_run_page.py": ("a_browser_shows_a_top_that_moves",),
         "features/free_energy/test_virial.py": ("published_values",),
         "end_to_end/test_walk.py": ("a_sample_of_the_walk*",),
@@ -311,10 +322,6 @@ TIERS = {
         "features/studies/test_joint_fit.py": ("pulls_of_joint_limits_have_unit_width*",),
         "support/test_known.py": ("gyrocompass_swings",),
         "features/free_energy/test_mean_force.py": ("errors_are_those_of_repeated_samples",),
-        "features/view/test_notebook.py": (
-            "the_tutorial_runs",
-            "the_tutorial_shows_what_it_states",
-        ),
         "end_to_end/test_reference.py": ("a_cutoff_that_reaches_hundreds_of_clusters",),
         "run/test_resume.py": ("a_run_that_is_killed_continues[2*",),
         "run/test_simulation.py": tuple(
@@ -341,9 +348,6 @@ TIERS = {
         "features/studies/sweep/test_points.py": (
             "a_second_interrupt_ends_all_points_at_once",
             "points_end_with_their_sweep*",
-        ),
-        "features/potentials/test_user_code.py": (
-            "every_example_of_an_extension_runs_and_is_short*",
         ),
         "features/free_energy/test_virial.py": (
             "errors_are_honest",

@@ -128,13 +128,7 @@ def test_errors_of_numba_have_no_colours():
 # --- examples -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
-        pytest.param(path, id=path.stem, marks=[pytest.mark.soak] if path.stem == "mie" else [])
-        for path in SCRIPTS
-    ],
-)
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
 def test_every_example_of_an_extension_runs_and_is_short(path, monkeypatch):
     from rigidmd.analysis import registry
 
