@@ -14,7 +14,11 @@ from support.common import ROOT
 from support.processes import search_path
 
 FOLDER = ROOT / "tests" / "benchmarks"
-SCRIPTS = sorted(path for path in FOLDER.glob("*.py") if "__main__" in path.read_text())
+SCRIPTS = sorted(
+    path
+    for path in FOLDER.glob("*.py")
+    if "__main__" in path.read_text() and not path.name.startswith("test_")
+)
 PAGES = [ROOT / "README.md", *(ROOT / "rigidmd" / "docs").rglob("*.md")]
 
 
