@@ -66,8 +66,8 @@ MANUAL = "\n".join(
 LONG = ("run", "accuracy", "sweep", "virial", "stability")
 #: Commands, and options of commands, that no page runs, and the test that does.
 ELSEWHERE = {
-    "compare": "test_a_body_goes_on",
-    "resume": "test_a_body_goes_on",
+    "compare": "test_a_body_continues",
+    "resume": "test_a_body_continues",
     "--repeats": "test_the_smallest_form_runs_and_leaves_the_checkout_alone",
     "--scheduler": "test_points_run_on_a_cluster_of_dask",
     "--to": "test_a_script_for_slurm",
