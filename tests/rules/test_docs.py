@@ -243,9 +243,10 @@ class Reader:
                 pass
             case ["sbatch", _]:
                 assert not runs
-            case ["pytest", "-m", "soak", "-rP", script]:
+            case ["pytest", "-m", "soak", "-rP", *scripts]:
                 assert not runs
-                assert "@pytest.mark.soak" in (ROOT / script).read_text()
+                for script in scripts:
+                    assert "@pytest.mark.soak" in (ROOT / script).read_text()
             case _:
                 pytest.fail(f"no command that this test knows: {words}")
 
