@@ -62,7 +62,9 @@ def command_in(folder, *words, **environment):
 SHORT_TOP = ["--set", "run.duration_s=0.02"]
 
 
-def test_nothing_in_the_working_directory_is_executed_or_obeyed(hostile, tmp_path, monkeypatch):
+def test_nothing_in_the_working_directory_is_executed_or_obeyed(
+    hostile, tmp_path, monkeypatch, draws
+):
     monkeypatch.chdir(tmp_path)
     shutil.copy(ROOT / "systems" / "heavy_top_3.toml", hostile / "top.toml")
     shutil.copy(ROOT / "systems" / "heavy_top_3.toml", tmp_path / "top.toml")

@@ -16,12 +16,11 @@ from rigidmd.units import COULOMB
     [
         (1e-5, "ewald"),
         (1e-5, "pme"),
+        pytest.param(1e-4, "pme", marks=pytest.mark.extended),
         *(
-            pytest.param(
-                asked, method, marks=pytest.mark.extended if asked == 1e-4 else pytest.mark.soak
-            )
+            pytest.param(asked, method, marks=pytest.mark.soak)
             for asked, method in product([1e-3, 1e-4, 1e-5, 1e-6], ["ewald", "pme"])
-            if asked != 1e-5
+            if asked != 1e-5 and (asked, method) != (1e-4, "pme")
         ),
     ],
 )
