@@ -58,14 +58,15 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
         system.notes.append(system.scene.coupling.in_short)
     system.notes.extend(system.scene.rounded_times())
     system.notes.extend(set_momenta(system.scene, system.model, system.state, resolved.start))
-    system.notes.extend(_molecule_notes(system))
+    system.notes.extend(_system_notes(system))
     system.notes.extend(_start_notes(system, resolved.start))
     return system
 
 
 def _system_of(resolved: ResolvedScene) -> System:
     """The system of a resolved scene without the code of users, at rest. Raises SceneError."""
-    scene, parts = resolved.scene, resolved.parts
+    parts = resolved.parts
+    scene = parts.scene
     acting = acting_in(scene, parts)
     others = () if scene.coupling is None else scene.coupling.lambdas
     at = {x: acting_in(at_lambda(scene, x), parts) for x in others}
@@ -133,7 +134,7 @@ def _ensemble_errors(system: System) -> list[str]:
     return [f"stages.{k}: {why}" for k, stage in stages if stage.is_hybrid and driven]
 
 
-def _molecule_notes(system: System) -> list[str]:
+def _system_notes(system: System) -> list[str]:
     """Notes on stages in which nothing moves, on mixing rules and on files of models."""
     scene, kinds = system.scene, {m.name: m for m in system.species}.values()
     stuck = "nothing moves and no temperature is defined. Use thermostat = 'langevin'"

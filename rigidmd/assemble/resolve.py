@@ -27,10 +27,9 @@ from rigidmd.units import BOLTZMANN
 
 
 class ResolvedScene(NamedTuple):
-    """A scene with its defaults, and the parts of its system."""
+    """The parts of the system of a scene with its defaults."""
 
-    scene: MolecularScene
-    parts: SystemParts
+    parts: SystemParts  # the scene is among them
     model: Model
     start: Configuration
     temperature: float  # of velocities from a file, K
@@ -69,7 +68,6 @@ def resolve(scene: MolecularScene) -> ResolvedScene:
         cell=start.cell,
     )
     return ResolvedScene(
-        complete,
         SystemParts(complete, species, model, space, state, number, start.basis, resolved.pme_grid),
         model,
         start,

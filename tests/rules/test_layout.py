@@ -18,14 +18,17 @@ TESTED_BY = {
     " commands/streams core/plain_text scene/json_schema",
     "commands/test_examples.py": "commands/new core/shipped",
     "compile/test_simd.py": "compile/simd_memory compile/simd_types",
-    "core/test_integrators.py": "dynamics/force_gradient",
+    "core/test_integrators.py": "dynamics/force_gradient scene/integrators",
     "core/test_state.py": "core/state_file",
     "dynamics/test_registers.py": "dynamics/observables",
     "dynamics/test_step_loop.py": "mechanics/batches",
     "dynamics/test_thermostats.py": "assemble/stage_description",
     "end_to_end/test_faults.py": "core/files core/signals",
     "end_to_end/test_hostile_input.py": "core/process core/toml",
-    "engines/cpu/test_program.py": "engines/cpu/compiled engines/protocol",
+    "engines/cpu/test_program.py": "compile/program engines/cpu/compiled engines/protocol",
+    "forces/fields/test_fields.py": "scene/fields",
+    "assemble/test_species.py": "scene/species",
+    "rules/test_schema.py": "commands/schema",
     "features/analysis/test_runs.py": "analysis/files analysis/report analysis/registry"
     " commands/analyse",
     "features/analysis/test_conditions.py": "analysis/options",
@@ -63,6 +66,7 @@ TESTED_BY = {
     " dynamics/user_kernels",
     "features/studies/accuracy/test_averages.py": "studies/accuracy/averages_report",
     "features/studies/sweep/test_sweeping.py": "commands/compare commands/sweep studies/compare"
+    " studies/sweep/folder"
     " studies/sweep/replicas",
     "features/studies/sweep/test_table.py": "studies/sweep/figure",
     "features/studies/test_normal_modes.py": "commands/modes studies/gamma_point",
@@ -83,12 +87,13 @@ TESTED_BY = {
     "run/test_checks.py": "assemble/harmonic run/failed_check run/rigid_fit run/stable_step",
     "run/test_observers.py": "run/molecular_observers",
     "run/test_pilot.py": "run/trial_systems run/trials",
-    "run/test_resume.py": "io/write run/record",
+    "run/test_resume.py": "commands/resume io/write run/record",
     "run/test_results.py": "engines/observables",
     "run/test_simulation.py": "engines/sites engines/system run/loop run/molecular run/part",
     "run/test_summary.py": "run/report run/short_report",
     "scene/test_hints.py": "scene/base scene/stage",
-    "scene/test_molecules.py": "formats/bonds io/scene_file",
+    "scene/test_validation.py": "errors",
+    "scene/test_molecules.py": "commands/models formats/bonds io/scene_file",
     "support/test_tiers.py": "core/bound_process",
 }
 #: Test files whose name is neither that of a module nor that of a package -> what they test.
@@ -137,9 +142,12 @@ def module_names() -> dict[str, Path]:
 
 def has_file_of_its_name(module: str) -> bool:
     """Whether a test file has the name of a module, or of the package in a package that it is
-    in."""
-    names = module.split("/")
-    return not {names[-1], *names[1:-1]}.isdisjoint(names_of_files().values())
+    in. The file is in the folder of the package or among the features."""
+    package, *inner = module.split("/")
+    return any(
+        name in (inner or [package]) and file.startswith((f"{package}/", "features/"))
+        for file, name in names_of_files().items()
+    )
 
 
 def test_every_module_with_logic_has_a_test_file():

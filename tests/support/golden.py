@@ -180,7 +180,9 @@ def printed(*arguments: str, code: int | None = None) -> str:
             ended = rigidmd_main(list(arguments))
         except SystemExit as end:
             ended = int(end.code or 0)
-    text = WALL_TIME.sub("", output.getvalue()).replace(f"{Path.cwd()}/", "")
+    text = WALL_TIME.sub("", output.getvalue())
+    for folder in (Path.cwd(), sys.prefix):  # of this case, and of Python
+        text = text.replace(f"{folder}/", "")
     if code is not None and ended != code:
         raise RuntimeError(f"{' '.join(arguments)} ends with {ended}: {text}")
     return f"{text}exit code {ended}"
