@@ -17,10 +17,10 @@ from rigidmd.assemble.stage_description import stage_notes
 from rigidmd.assemble.start import Configuration, overlaps, set_momenta
 from rigidmd.assemble.time_step import with_precision
 from rigidmd.core.integrators import Scheme
-from rigidmd.dynamics.barostats import BAROSTATS, Confinement, Pressure
+from rigidmd.dynamics.barostats import Confinement, Pressure
 from rigidmd.dynamics.model import Model, conserved_momentum, count_degrees_of_freedom, mobile
 from rigidmd.dynamics.noise import BAROSTAT, THERMOSTAT, key_of
-from rigidmd.dynamics.thermostats import THERMOSTATS, Ramp
+from rigidmd.dynamics.thermostats import Ramp
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, StructureError
 from rigidmd.forces.neighbors.space import Space
@@ -280,13 +280,14 @@ def integrator_of_stage(system: System, k: int) -> Scheme:
     momentum."""
     stage = system.scene.stages[k]
     scheme = stage.scheme
-    thermostat = system.user_thermostat(k)
-    if system.thermostat is None and stage.has_thermostat:
-        thermostat = thermostat_of(system, k)
-    if stage.is_hybrid and system.thermostat is None:
+    if system.thermostat is not None:
+        if (thermostat := system.user_thermostat(k)) is not None:
+            scheme = scheme.with_thermostat(thermostat, halved=thermostat.halved)
+    elif stage.is_hybrid:
         scheme = scheme.with_trajectories(thermostat_of(system, k), stage.steps_together)
-    elif thermostat is not None:
-        scheme = scheme.with_thermostat(thermostat, halved=getattr(thermostat, "halved", True))
+    elif stage.has_thermostat:
+        halved = couplings.THERMOSTATS[stage.thermostat_kind].halved
+        scheme = scheme.with_thermostat(thermostat_of(system, k), halved=halved)
     if stage.has_barostat:
         barostat = barostat_of(system, k)
         in_steps = couplings.BAROSTATS[stage.barostat_kind].in_verlet_steps
@@ -303,7 +304,8 @@ def thermostat_of(system: System, k: int) -> NamedTuple:
     stage = system.scene.stages[k]
     thermal = _thermal(stage)
     key = key_of(system.scene.seed, THERMOSTAT, k)
-    return THERMOSTATS[stage.thermostat_kind](stage, thermal, system.freedom_in(k), key)
+    module = import_module(f"rigidmd.dynamics.thermostats.{stage.thermostat_kind}")
+    return module.thermostat(stage, thermal, system.freedom_in(k), key)
 
 
 def barostat_of(system: System, k: int) -> NamedTuple:
@@ -323,7 +325,8 @@ def barostat_of(system: System, k: int) -> NamedTuple:
         (0.0, 0.0) if system.tail is None else system.tail[:2],
         key,
     )
-    return BAROSTATS[stage.barostat_kind](stage, confinement)
+    module = import_module(f"rigidmd.dynamics.barostats.{stage.barostat_kind}")
+    return module.barostat(stage, confinement)
 
 
 def _thermal(stage: Stage) -> Ramp:

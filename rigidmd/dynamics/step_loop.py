@@ -28,17 +28,15 @@ from rigidmd.core.integrators import (
     DRIFT,
     KICK,
     REMOVE_MOMENTUM,
-    SCALE_BOX,
     THERMOSTAT,
     Scheme,
 )
 from rigidmd.core.state import EXAMPLE, NOW, OK, ORIGIN, REMOVED, WORK, Load, State
 from rigidmd.dynamics.barostats import (
     BarostatWorkspace,
-    barostat_pass,
+    barostat_passes,
     compute_step_load,
     needed_tallies,
-    piston_pass,
 )
 from rigidmd.dynamics.flows import ORTHOGONALITY_INTERVAL, flow_arrays
 from rigidmd.dynamics.force_gradient import (
@@ -117,10 +115,7 @@ def coupling_passes(
     if thermostat is not None:
         passes[THERMOSTAT] = thermostat_pass(thermostat, model, code, state, heat, registers)
     if box is not None:
-        passes[BAROSTAT] = barostat_pass(
-            barostat, model, terms, state, load, box, registers, status
-        )
-        passes[SCALE_BOX] = piston_pass(barostat, state, registers)
+        passes |= barostat_passes(barostat, model, terms, state, load, box, registers, status)
     if trajectory is not None:
         kinds |= {FAILED} | ({AFTER_BAROSTAT} if box is not None else set())
         passes |= trajectory_passes(

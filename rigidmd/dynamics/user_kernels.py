@@ -5,9 +5,13 @@ from collections.abc import Callable
 from functools import cache
 from typing import TypeVar
 
+import numpy as np
+
 from rigidmd.compile import implements
 from rigidmd.compile.kernels import compile_user_function
-from rigidmd.dynamics.thermostats import apply_thermostat
+from rigidmd.core.state import State
+from rigidmd.dynamics.model import Model
+from rigidmd.dynamics.thermostats import Tasks, apply_thermostat
 from rigidmd.forces.terms import add_forces
 
 #: The registered classes, and the function of each.
@@ -65,6 +69,15 @@ def compiled_force(kind: type) -> Callable[[Function], Function]:
     return register
 
 
+class UserThermostat:
+    """Attributes that the class of a user's thermostat may have, with the defaults."""
+
+    halved = True
+
+    def tasks(self, model: Model, state: State, workspace: np.ndarray) -> Tasks:
+        return {}
+
+
 def compiled_thermostat(kind: type) -> Callable[[Function], Function]:
     """Make a NamedTuple class a thermostat: a flow on the momenta.
 
@@ -104,6 +117,9 @@ def compiled_thermostat(kind: type) -> Callable[[Function], Function]:
                     state.energy_ledger[0] += (factor**2 - 1.0) * before
     """
     _check_class(kind)
+    for name in ("halved", "tasks"):
+        if not hasattr(kind, name):
+            setattr(kind, name, getattr(UserThermostat, name))
 
     def register(function: Function) -> Function:
         _check_arguments(function, ("thermostat", "model", "state", "h", "draw"))

@@ -47,6 +47,7 @@ class Coupling(NamedTuple):
     #: the values of its keys.
     on_molecules: bool = False
     in_trajectories: bool = False  # whether steps are accepted or rejected together
+    halved: bool = True  # half of its flow before a step and half after it, or all after it
     #: Whether translation and rotation each have a thermostat, which relaxes their kinetic energy
     #: to its mean in the time constant.
     by_motion: bool = False
@@ -102,6 +103,7 @@ THERMOSTATS = {
         "Bussi, Donadio & Parrinello 2007, J. Chem. Phys. 126, 014101",
         {"thermostat_time_ps": 0.05},
         by_motion=True,
+        halved=False,
     ),
     "langevin": Coupling(
         "friction and noise",

@@ -14,6 +14,7 @@ from rigidmd.compile import BoundTask
 from rigidmd.core.integrators import REMOVE_MOMENTUM, THERMOSTAT
 from rigidmd.core.state import NOW, ORIGIN, REMOVED
 from rigidmd.dynamics import barostats, step_loop, thermostats
+from rigidmd.dynamics.barostats.cell_rescaling import strain_force
 from rigidmd.dynamics.model import draw_momenta, remove_momentum
 from rigidmd.dynamics.noise import BAROSTAT
 from rigidmd.errors import SceneError
@@ -255,7 +256,7 @@ def test_a_ramp_is_even_over_the_steps_of_its_stage():
 
 @numba.njit
 def _driving(box, model, state, room, k, volume, thermal):
-    return barostats.strain_force(box, model, state, room, k, volume, thermal)
+    return strain_force(box, model, state, room, k, volume, thermal)
 
 
 def test_what_drives_the_cell_follows_a_ramp_of_the_pressure():

@@ -10,7 +10,8 @@ from rigidmd.core.integrators import SCHEMES, Solver
 from rigidmd.core.state import HEAT, NOW, ORIGIN, state_of
 from rigidmd.core.state_file import read_state, write_state
 from rigidmd.dynamics.noise import THERMOSTAT, key_of
-from rigidmd.dynamics.thermostats import VelocityRescaling, constant_ramp
+from rigidmd.dynamics.thermostats import constant_ramp
+from rigidmd.dynamics.thermostats.velocity_rescaling import VelocityRescaling
 from rigidmd.errors import StructureError
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene

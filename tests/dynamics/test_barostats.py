@@ -14,13 +14,16 @@ from rigidmd.dynamics import barostats
 from rigidmd.dynamics.barostats import (
     COMPONENTS,
     COUPLINGS,
-    CellRescaling,
     Pressure,
-    VolumeMoves,
     barostat_workspace,
+    cell_rescaling,
 )
+from rigidmd.dynamics.barostats.cell_rescaling import CellRescaling
+from rigidmd.dynamics.barostats.monte_carlo import VolumeMoves
 from rigidmd.dynamics.noise import BAROSTAT, THERMOSTAT, key_of
-from rigidmd.dynamics.thermostats import Langevin, VelocityRescaling, constant_ramp
+from rigidmd.dynamics.thermostats import constant_ramp
+from rigidmd.dynamics.thermostats.langevin import Langevin
+from rigidmd.dynamics.thermostats.velocity_rescaling import VelocityRescaling
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Simulation
 from rigidmd.run.minimise import remove_overlaps
@@ -35,7 +38,7 @@ QUIET = {"trajectory": False, "figures": False}
 
 @numba.njit
 def driving(box, model, state, room, k, volume, thermal):
-    return barostats.strain_force(box, model, state, room, k, volume, thermal)
+    return cell_rescaling.strain_force(box, model, state, room, k, volume, thermal)
 
 
 @numba.njit
@@ -181,7 +184,7 @@ def test_a_flexible_move_has_the_chance_of_its_density_of_states(liquid):
 
 @numba.njit
 def drift(box, model, state, room, h, mean, variance):
-    barostats.drift(box, model, state, room, h, mean, variance)
+    cell_rescaling.drift(box, model, state, room, h, mean, variance)
 
 
 def prepared(system, engine, box, before, after, room, h):

@@ -12,7 +12,8 @@ from rigidmd.core.state import HEAT, State, state_of
 from rigidmd.core.statistics import slope
 from rigidmd.dynamics.model import draw_momenta
 from rigidmd.dynamics.noise import THERMOSTAT, key_of
-from rigidmd.dynamics.thermostats import VelocityRescaling, constant_ramp
+from rigidmd.dynamics.thermostats import constant_ramp
+from rigidmd.dynamics.thermostats.velocity_rescaling import VelocityRescaling
 from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.errors import SceneError
 from rigidmd.forces.neighbors.sites import blocks_of

@@ -1,7 +1,9 @@
 """Thermostats: exact distributions of free bodies, heat to the last digit, chains that conserve,
 the same bits."""
 
+import sys
 import tomllib
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,11 +18,15 @@ from rigidmd.compile import implements, kernel
 from rigidmd.core.integrators import DRIFT, KICK, SCHEMES, WITH_THERMOSTAT, Flow, Scheme
 from rigidmd.core.integrators import THERMOSTAT as THERMOSTAT_FLOW
 from rigidmd.core.state import HEAT
-from rigidmd.dynamics import barostats, thermostats
+from rigidmd.dynamics import barostats
 from rigidmd.dynamics.noise import BATCH, THERMOSTAT, key_of
-from rigidmd.dynamics.thermostats import Andersen, Langevin, NoseHoover, Ramp, constant_ramp
+from rigidmd.dynamics.thermostats import Ramp, constant_ramp
+from rigidmd.dynamics.thermostats.andersen import Andersen
+from rigidmd.dynamics.thermostats.langevin import Langevin
+from rigidmd.dynamics.thermostats.nose_hoover import NoseHoover
 from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.errors import SceneError
+from rigidmd.forces.terms import WITH_ENERGIES
 from rigidmd.mechanics.batches import apply_langevin_group
 from rigidmd.run import Simulation
 from rigidmd.run.minimise import remove_overlaps
@@ -381,6 +387,14 @@ class Swelling(NamedTuple):
     tail: tuple
     key: tuple
 
+    tallies = WITH_ENERGIES
+
+    def passes(self, state, registers):
+        return {}
+
+
+implements(barostats.apply_barostat, Swelling)(barostats.try_move)
+
 
 @implements(barostats.propose_strain, Swelling)
 def propose_swelling(barostat, model, state, workspace, h, draw):
@@ -420,10 +434,14 @@ def test_adding_a_thermostat_and_a_barostat(monkeypatch):
     )
     monkeypatch.setitem(couplings.BAROSTATS, "swelling", made)
     monkeypatch.setitem(
-        thermostats.THERMOSTATS, "braking", lambda stage, *given: Braking(stage.thermostat_time)
+        sys.modules,
+        "rigidmd.dynamics.thermostats.braking",
+        SimpleNamespace(thermostat=lambda stage, *given: Braking(stage.thermostat_time)),
     )
     monkeypatch.setitem(
-        barostats.BAROSTATS, "swelling", lambda stage, given: Swelling(0.01, given.tail, given.key)
+        sys.modules,
+        "rigidmd.dynamics.barostats.swelling",
+        SimpleNamespace(barostat=lambda stage, given: Swelling(0.01, given.tail, given.key)),
     )
     properties = schema()["$defs"]["Stage"]["properties"]
     assert (
@@ -470,13 +488,13 @@ def test_adding_a_thermostat_and_a_barostat(monkeypatch):
 @pytest.mark.parametrize(
     ("kinds", "physics"),
     [
-        (couplings.THERMOSTATS, "dynamics/thermostats.py"),
-        (couplings.BAROSTATS, "dynamics/barostats.py"),
+        (couplings.THERMOSTATS, "dynamics/thermostats"),
+        (couplings.BAROSTATS, "dynamics/barostats"),
     ],
 )
 def test_adding_a_thermostat_or_barostat_takes_two_files(kinds, physics):
     """No other file has their names but those of other engines, and that of langevin."""
-    allowed = {"scene/couplings.py", physics}
+    allowed = {"scene/couplings.py", *(f"{physics}/{name}.py" for name in kinds)}
     package = ROOT / "rigidmd"
     for path in package.rglob("*.py"):
         where = path.relative_to(package).as_posix()

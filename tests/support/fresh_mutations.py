@@ -348,7 +348,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F39",
         "ramps: one step late",
-        "dynamics/thermostats.py",
+        "dynamics/thermostats/__init__.py",
         "(state.step[NOW] - state.step[ORIGIN] + 1) / ramp.steps)",
         "(state.step[NOW] - state.step[ORIGIN]) / ramp.steps)",
         ("assemble/test_build.py::test_a_ramp_is_even_over_the_steps_of_its_stage",),
@@ -484,7 +484,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F55",
         "cell rescaling of a box that shears: the mean pressure counts as a shear stress",
-        "dynamics/barostats.py",
+        "dynamics/barostats/cell_rescaling.py",
         "target_pressure(barostat.pressure, state, k) - (mean if k < 3 else 0.0)",
         "target_pressure(barostat.pressure, state, k) - mean",
         (

@@ -147,7 +147,7 @@ RINGS = [
     Mutation(
         "B2",
         "Monte Carlo barostat: N + 1 in the rule of acceptance",
-        "dynamics/barostats.py",
+        "dynamics/barostats/monte_carlo.py",
         "    return barostat.molecules * log(after / before)",
         "    return (barostat.molecules + 1) * log(after / before)",
         (
@@ -158,7 +158,7 @@ RINGS = [
     Mutation(
         "B3",
         "Nose-Hoover: degrees of freedom of translation for those of rotation",
-        "dynamics/thermostats.py",
+        "dynamics/thermostats/nose_hoover.py",
         "stage.nose_hoover_links, freedom.translation, freedom.rotation",
         "stage.nose_hoover_links, freedom.translation, freedom.translation",
         ("assemble/test_build.py::test_chains_count_the_degrees_of_freedom_of_their_motion",),
@@ -166,15 +166,15 @@ RINGS = [
     Mutation(
         "B4",
         "Langevin: frictions of translation and rotation exchanged",
-        "dynamics/thermostats.py",
-        "Langevin(thermal, *stage.frictions, key)",
-        "Langevin(thermal, *stage.frictions[::-1], key)",
+        "dynamics/thermostats/langevin.py",
+        "Langevin(thermal_energy, *stage.frictions, key)",
+        "Langevin(thermal_energy, *stage.frictions[::-1], key)",
         ("assemble/test_build.py::test_langevin_has_the_friction_of_each_motion",),
     ),
     Mutation(
         "B5",
         "pressure ramp: the first pressure is kept",
-        "dynamics/barostats.py",
+        "dynamics/barostats/__init__.py",
         "    return pressure.first[k] + (pressure.last[k] - pressure.first[k]) * fraction",
         "    return pressure.first[k] + 0.0 * fraction",
         (

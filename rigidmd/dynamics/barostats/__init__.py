@@ -3,23 +3,23 @@ has none.
 
 See the theory chapter `sampling`. A lower triangular matrix T multiplies the cell (rows a, b, c)
 and the centres of mass from the right. The virial is W_ij = sum F_i R_j in `tally[1:]`.
-`apply_barostat` acts where a scheme has the flow BAROSTAT, `move_piston` where it has SCALE_BOX.
+`apply_barostat` acts where a scheme has the flow BAROSTAT; `try_move` is the one by trial moves.
 The energy added to the molecules is in `state.energy_ledger[WORK]`.
 """
 
-from math import exp, inf, log, sqrt
-from typing import NamedTuple
+from math import exp, log
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from rigidmd.compile import Pass, chosen_by_type, implements, is_a, kernel, load_arguments, task
+from rigidmd.compile import Pass, chosen_by_type, kernel, load_arguments, task
 from rigidmd.core.integrators import BAROSTAT
 from rigidmd.core.state import NOW, OK, ORIGIN, TALLY_SIZE, WORK, Load, State, no_load
-from rigidmd.dynamics.noise import Key, normals, uniforms
+from rigidmd.dynamics.noise import Key, uniforms
 from rigidmd.dynamics.registers import LOADED, TRIAL, Registers
-from rigidmd.dynamics.thermostats import Ramp, ramp_value, scale_array, translational_energy
+from rigidmd.dynamics.thermostats import Ramp
 from rigidmd.forces.neighbors.space import volume_of
-from rigidmd.forces.terms import WITH_ENERGIES, WITH_VIRIALS, TermTable, compute_load, copy
+from rigidmd.forces.terms import WITH_ENERGIES, TermTable, compute_load, copy
 
 #: Components of strains and pressures, in this order: (row, column) of the lower triangle.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))
@@ -32,11 +32,6 @@ COUPLINGS = {
     "normal": (-1, -1, 0, -1, -1, -1),
     "lateral": (0, 0, -1, -1, -1, -1),
 }
-#: Largest change of the volume in a Monte Carlo move, in standard deviations of its fluctuations.
-WIDTH = 2.0
-#: Largest factor of the volume in a Monte Carlo move, and of its inverse. Boxes of one or two
-#: molecules draw larger ones.
-LARGEST_FACTOR = 10.0
 #: Largest drift of a move, as a strain; noise is added to it. It limits the effect of a bad start
 #: in one move.
 LONGEST_DRIFT = 0.01
@@ -50,52 +45,6 @@ class Pressure(NamedTuple):
     steps: float
 
 
-class CellRescaling(NamedTuple):
-    """Stochastic cell rescaling (Bernetti & Bussi 2020, J. Chem. Phys. 153, 114107; anisotropic
-    cells: Del Tatto, Raiteri, Bernetti & Bussi 2022, Appl. Sci. 12, 1139), with an acceptance test:
-    see the theory chapter `sampling`."""
-
-    thermal_energy: Ramp  # kB T, u Å²/ps²
-    pressure: Pressure
-    rate: float  # compressibility over time constant, Å ps²/u/ps
-    coordinate: tuple[int, int, int, int, int, int]  # of COUPLINGS
-    # 1 for each axis along which the total momentum is kept at zero, else 0
-    at_rest: tuple[float, float, float]
-    tail: tuple[float, float]  # dispersion beyond the cutoff: energy times V, pressure times V²
-    key: Key
-
-
-class VolumeMoves(NamedTuple):
-    """Monte Carlo barostat (Åqvist et al. 2004, Chem. Phys. Lett. 384, 288), see the theory chapter
-    `sampling`."""
-
-    thermal_energy: Ramp
-    pressure: Pressure
-    width: float  # largest change of the volume, Å³
-    molecules: float  # number of molecules that are not frozen
-    tail: tuple[float, float]
-    key: Key
-
-
-class Piston(NamedTuple):
-    """Isotropic volume with inertia and no noise (Andersen 1980, J. Chem. Phys. 72, 2384): constant
-    enthalpy.
-
-    Pi is the last number of `state.extra_variables`. BAROSTAT is a kick of Pi, SCALE_BOX a change
-    of V, each exact. What P0 V and the piston gain is subtracted from `energy_ledger[WORK]`. See
-    the theory chapter `sampling`.
-    """
-
-    pressure: Pressure
-    inverse_mass: float  # 1/M, Å⁴/u
-    # a: velocities follow V^(-a/3). 1, or 3 N over the translational degrees of freedom, so that
-    # the kinetic part of the pressure contains a total momentum that is kept at zero
-    exponent: float
-    tail: tuple[float, float]
-
-    variables = 1  # how many numbers it has in `state.extra_variables`
-
-
 class Confinement(NamedTuple):
     """What a barostat is made from, in addition to the keys of its stage."""
 
@@ -103,39 +52,11 @@ class Confinement(NamedTuple):
     pressure: Pressure
     compressibility: float  # Å ps²/u
     volume: float  # at the start, Å³
-    molecules: float  # see `VolumeMoves`
-    at_rest: tuple[float, float, float]  # see `CellRescaling`
-    tail: tuple[float, float]
+    molecules: float  # number of molecules that are not frozen
+    # 1 for each axis along which the total momentum is kept at zero, else 0
+    at_rest: tuple[float, float, float]
+    tail: tuple[float, float]  # dispersion beyond the cutoff: energy times V, pressure times V²
     key: Key
-
-
-#: Name of a barostat in `scene.couplings` -> the function that makes it for a stage from a
-#: `Confinement`.
-BAROSTATS = {
-    "cell_rescaling": lambda stage, given: CellRescaling(
-        given.thermal_energy,
-        given.pressure,
-        given.compressibility / stage.barostat_time,
-        COUPLINGS[stage.pressure_coupling],
-        given.at_rest,
-        given.tail,
-        given.key,
-    ),
-    "monte_carlo": lambda stage, given: VolumeMoves(
-        given.thermal_energy,
-        given.pressure,
-        WIDTH * sqrt(max(given.thermal_energy[:2]) * given.compressibility * given.volume),
-        given.molecules,
-        given.tail,
-        given.key,
-    ),
-    "piston": lambda stage, given: Piston(
-        given.pressure,
-        given.compressibility * given.volume * (2 * np.pi / stage.barostat_time) ** 2,
-        3 * given.molecules / (3 * given.molecules - sum(given.at_rest) or inf),
-        given.tail,
-    ),
-}
 
 
 class BarostatWorkspace(NamedTuple):
@@ -167,12 +88,24 @@ def barostat_workspace(state: State) -> BarostatWorkspace:
     )
 
 
-def needed_tallies(barostat: tuple | None) -> int:
-    """What `compute_load` has to compute in a step in which a barostat acts: WITH_VIRIALS or
-    WITH_ENERGIES; 0: no more than in other steps."""
-    if barostat is None:
-        return 0
-    return WITH_VIRIALS if isinstance(barostat, Piston) else WITH_ENERGIES
+class Barostat(Protocol):
+    """The record of a barostat, a NamedTuple."""
+
+    @property
+    def tallies(self) -> int:
+        """What `compute_load` has to compute in a step in which it acts, WITH_VIRIALS or
+        WITH_ENERGIES."""
+        ...
+
+    def passes(self, state: State, registers: Registers) -> dict[int, Pass]:
+        """Kind of a flow -> its pass, for flows in addition to BAROSTAT."""
+        ...
+
+
+def needed_tallies(barostat: Barostat | None) -> int:
+    """What `compute_load` has to compute in a step in which a barostat acts; 0: no more than in
+    other steps."""
+    return 0 if barostat is None else barostat.tallies
 
 
 @kernel(inline=True)
@@ -207,22 +140,10 @@ def compute_load_and_virial(terms, state, load, workspace, which):
     return status
 
 
-@kernel
-def move_piston(barostat, state, h):
-    """The flow of the volume by the inertia of a piston, in place."""
-    volume = volume_of(state.cell)
-    after = volume + h * barostat.inverse_mass * state.extra_variables[-1]
-    scale = (after / volume) ** (1 / 3)
-    scale_array(state.position, scale)
-    scale_array(state.velocity, scale**-barostat.exponent)
-    scale_array(state.cell, scale)
-    state.energy_ledger[WORK] -= target_pressure(barostat.pressure, state, 0) * (after - volume)
-
-
 @chosen_by_type
 def apply_barostat(barostat, model, terms, state, load, workspace, progress, h, draw):
     """The flow of a barostat over a time h, in place. A status code. progress : see `registers`."""
-    return _kick_piston if is_a(barostat, Piston) else _try_move
+    return None
 
 
 @task()
@@ -234,15 +155,8 @@ def _apply_barostat(arguments, block):
     )
 
 
-@task()
-def _move_piston(arguments, block):
-    barostat, state, registers = load_arguments(arguments)
-    move_piston(barostat, state, registers.h[0])
-    registers.progress[LOADED] = 0
-
-
-def barostat_pass(
-    barostat: NamedTuple,
+def barostat_passes(
+    barostat: Barostat,
     model: NamedTuple,
     terms: TermTable,
     state: State,
@@ -250,39 +164,18 @@ def barostat_pass(
     workspace: BarostatWorkspace,
     registers: Registers,
     status: np.ndarray,
-) -> Pass:
-    """`apply_barostat` over the time in the registers."""
-    return Pass(
-        "barostat",
-        _apply_barostat,
-        (barostat, model, terms, state, load, workspace, registers, status),
-    )
+) -> dict[int, Pass]:
+    """Kind of a flow -> its pass: `apply_barostat` over the time in the registers, and others."""
+    arguments = (barostat, model, terms, state, load, workspace, registers, status)
+    return {
+        BAROSTAT: Pass("barostat", _apply_barostat, arguments),
+        **barostat.passes(state, registers),
+    }
 
 
-def piston_pass(barostat: Piston, state: State, registers: Registers) -> Pass:
-    """`move_piston` over the time in the registers."""
-    return Pass("volume", _move_piston, (barostat, state, registers))
-
-
-def _kick_piston(barostat, model, terms, state, load, workspace, progress, h, draw):
-    if progress[LOADED] == 0 or workspace.known[0] == 0:
-        status = compute_load_and_virial(terms, state, load, workspace, WITH_VIRIALS)
-        if status != OK:
-            return status
-        progress[LOADED] = 1
-    volume = volume_of(state.cell)
-    virial = workspace.tally[0, 1] + workspace.tally[0, 5] + workspace.tally[0, 9]
-    momenta = 2 * barostat.exponent * translational_energy(model, state)
-    pressure = (momenta + virial) / (3 * volume) + barostat.tail[1] / volume**2
-    before = state.extra_variables[-1]
-    state.extra_variables[-1] += h * (pressure - target_pressure(barostat.pressure, state, 0))
-    state.energy_ledger[WORK] -= (
-        0.5 * barostat.inverse_mass * (state.extra_variables[-1] ** 2 - before**2)
-    )
-    return OK
-
-
-def _try_move(barostat, model, terms, state, load, workspace, progress, h, draw):
+def try_move(barostat, model, terms, state, load, workspace, progress, h, draw):
+    """`apply_barostat` by a trial move: `propose_strain`, `rescale_velocities`, and the Metropolis
+    test with `log_acceptance`."""
     if progress[TRIAL] == 0:
         if progress[LOADED] == 0 or workspace.known[0] == 0:
             progress[LOADED] = 0
@@ -325,139 +218,14 @@ def propose_strain(barostat, model, state, workspace, h, draw):
     raise TypeError("compiled code only")
 
 
-@implements(propose_strain, VolumeMoves)
-def propose_volume(barostat, model, state, workspace, h, draw):
-    u, _ = uniforms(barostat.key, draw, 0, state.step[NOW])
-    factor = 1 + (2 * u - 1) * barostat.width / volume_of(state.cell)
-    # Also for the reverse move: a volume that one move reaches has to be as easy to leave by one.
-    if not 1 / LARGEST_FACTOR <= factor <= LARGEST_FACTOR:
-        return False
-    workspace.strain[0] = 0.0
-    for k in range(3):
-        workspace.strain[0, k] = log(factor) / 3
-    set_matrices(workspace)
-    return True
-
-
-@implements(propose_strain, CellRescaling)
-def propose_rescaling(barostat, model, state, workspace, h, draw):
-    drift(barostat, model, state, workspace, h, workspace.strain[1], workspace.strain[2])
-    for c in range(6):
-        xi, _ = normals(barostat.key, draw + c, 0, state.step[NOW])
-        for k in range(6):
-            if barostat.coordinate[k] == c:
-                workspace.strain[0, k] = workspace.strain[1, k] + sqrt(workspace.strain[2, k]) * xi
-    set_matrices(workspace)
-    return True
-
-
-@kernel
-def drift(barostat, model, state, workspace, h, mean, variance):
-    """Write mean and variance of the strain of a move, by component (6,), 0 for a component that
-    does not move."""
-    volume = volume_of(state.cell)
-    thermal = ramp_value(barostat.thermal_energy, state)
-    for k in range(6):
-        mean[k] = variance[k] = 0.0
-    for c in range(6):
-        push, shared = 0.0, 0
-        for k in range(6):
-            if barostat.coordinate[k] == c:
-                push += strain_force(barostat, model, state, workspace, k, volume, thermal)
-                shared += 1
-        for k in range(6):
-            if barostat.coordinate[k] == c:
-                variance[k] = 2 * thermal * barostat.rate * h / (3 * volume * shared)
-                mean[k] = max(
-                    -LONGEST_DRIFT, min(LONGEST_DRIFT, variance[k] / (2 * thermal) * push)
-                )
-
-
-@kernel
-def strain_force(barostat, model, state, workspace, k, volume, thermal):
-    """The generalised force on component k of the strain: minus the derivative of H + P0 V, u
-    Å²/ps²."""
-    i, j = COMPONENTS[k]
-    total = workspace.tally[0, 1 + 3 * j + i] - volume * target_pressure(
-        barostat.pressure, state, k
-    )
-    for m in range(len(state.velocity)):
-        total += model.mass[model.species[m]] * state.velocity[m, i] * state.velocity[m, j]
-    if k < 3:
-        total += barostat.tail[1] / volume + barostat.at_rest[k] * thermal
-    return total
-
-
-@chosen_by_type
 def rescale_velocities(barostat, state, workspace):
     """Change the velocities with the strain, unless the barostat keeps them."""
-    if not is_a(barostat, CellRescaling):
-        return lambda barostat, state, workspace: None
-
-    def divide_velocities(barostat, state, workspace):
-        inverse = workspace.matrices[1]
-        for m in range(len(state.velocity)):
-            x, y, z = state.velocity[m, 0], state.velocity[m, 1], state.velocity[m, 2]
-            state.velocity[m, 0] = inverse[0, 0] * x
-            state.velocity[m, 1] = inverse[1, 0] * x + inverse[1, 1] * y
-            state.velocity[m, 2] = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2] * z
-
-    return divide_velocities
+    raise TypeError("compiled code only")
 
 
 def log_acceptance(barostat, model, state, workspace, h):
     """The logarithm of the acceptance probability of a move that has been made."""
     raise TypeError("compiled code only")
-
-
-@implements(log_acceptance, VolumeMoves)
-def log_acceptance_of_volume(barostat, model, state, workspace, h):
-    before, after = volume_of(workspace.cell), volume_of(state.cell)
-    work = target_pressure(barostat.pressure, state, 0) * (after - before)
-    work = energy_gained(barostat, model, state, workspace) + work
-    return barostat.molecules * log(after / before) - work / ramp_value(
-        barostat.thermal_energy, state
-    )
-
-
-@implements(log_acceptance, CellRescaling)
-def log_acceptance_of_rescaling(barostat, model, state, workspace, h):
-    before, after = volume_of(workspace.cell), volume_of(state.cell)
-    matrix, inverse = workspace.matrices[0], workspace.matrices[1]
-    there = workspace.strain
-    back = np.zeros((2, 6))
-    drift(barostat, model, state, workspace, h, back[0], back[1])
-    target = barostat.pressure
-    x, y, z = (
-        target_pressure(target, state, 0),
-        target_pressure(target, state, 1),
-        target_pressure(target, state, 2),
-    )
-    mean = (x + y + z) / 3
-    work = energy_gained(barostat, model, state, workspace) + mean * (after - before)
-    chance = log(after / before)
-    used = -1
-    for k in range(6):
-        if barostat.coordinate[k] < 0:
-            continue
-        i, j = COMPONENTS[k]
-        turn = there[0, k]
-        turn_back = -turn if k < 3 else inverse[i, j]
-        deviation = target_pressure(barostat.pressure, state, k) - (mean if k < 3 else 0.0)
-        work += deviation * 0.5 * (before + after) * 0.5 * (turn - turn_back)
-        if k < 3:
-            chance += barostat.at_rest[k] * turn
-        if (
-            barostat.coordinate[k] > used
-        ):  # coordinates are numbered in the order of their first component
-            used = barostat.coordinate[k]
-            chance += 0.5 * (turn - there[1, k]) ** 2 / there[2, k] + 0.5 * log(there[2, k])
-            chance -= 0.5 * (turn_back - back[0, k]) ** 2 / back[1, k] + 0.5 * log(back[1, k])
-    if barostat.coordinate[3] >= 0:
-        # densities of T and of its inverse in the left invariant measure of lower triangular
-        # matrices
-        chance -= 2 * (log(matrix[1, 1]) + 2 * log(matrix[2, 2]))
-    return chance - work / ramp_value(barostat.thermal_energy, state)
 
 
 @kernel

@@ -1,0 +1,92 @@
+"""Monte Carlo changes of the volume."""
+
+from math import log, sqrt
+from typing import NamedTuple
+
+from rigidmd.compile import Pass, implements
+from rigidmd.core.state import NOW, State
+from rigidmd.dynamics.barostats import (
+    Confinement,
+    Pressure,
+    apply_barostat,
+    energy_gained,
+    log_acceptance,
+    propose_strain,
+    rescale_velocities,
+    set_matrices,
+    target_pressure,
+    try_move,
+)
+from rigidmd.dynamics.noise import Key, uniforms
+from rigidmd.dynamics.registers import Registers
+from rigidmd.dynamics.thermostats import Ramp, ramp_value
+from rigidmd.forces.neighbors.space import volume_of
+from rigidmd.forces.terms import WITH_ENERGIES
+from rigidmd.scene.stage import Stage
+
+#: Largest change of the volume in a Monte Carlo move, in standard deviations of its fluctuations.
+WIDTH = 2.0
+#: Largest factor of the volume in a Monte Carlo move, and of its inverse. Boxes of one or two
+#: molecules draw larger ones.
+LARGEST_FACTOR = 10.0
+
+
+class VolumeMoves(NamedTuple):
+    """Monte Carlo barostat (Åqvist et al. 2004, Chem. Phys. Lett. 384, 288), see the theory chapter
+    `sampling`."""
+
+    thermal_energy: Ramp
+    pressure: Pressure
+    width: float  # largest change of the volume, Å³
+    molecules: float  # number of molecules that are not frozen
+    tail: tuple[float, float]
+    key: Key
+
+    tallies = WITH_ENERGIES
+
+    def passes(self, state: State, registers: Registers) -> dict[int, Pass]:
+        return {}
+
+
+def barostat(stage: Stage, confinement: Confinement) -> VolumeMoves:
+    thermal_energy = max(confinement.thermal_energy[:2])
+    return VolumeMoves(
+        confinement.thermal_energy,
+        confinement.pressure,
+        WIDTH * sqrt(thermal_energy * confinement.compressibility * confinement.volume),
+        confinement.molecules,
+        confinement.tail,
+        confinement.key,
+    )
+
+
+implements(apply_barostat, VolumeMoves)(try_move)
+
+
+@implements(propose_strain, VolumeMoves)
+def propose_volume(barostat, model, state, workspace, h, draw):
+    u, _ = uniforms(barostat.key, draw, 0, state.step[NOW])
+    factor = 1 + (2 * u - 1) * barostat.width / volume_of(state.cell)
+    # Also for the reverse move: a volume that one move reaches has to be as easy to leave by one.
+    if not 1 / LARGEST_FACTOR <= factor <= LARGEST_FACTOR:
+        return False
+    workspace.strain[0] = 0.0
+    for k in range(3):
+        workspace.strain[0, k] = log(factor) / 3
+    set_matrices(workspace)
+    return True
+
+
+@implements(rescale_velocities, VolumeMoves)
+def keep_velocities(barostat, state, workspace):
+    return None
+
+
+@implements(log_acceptance, VolumeMoves)
+def log_acceptance_of_volume(barostat, model, state, workspace, h):
+    before, after = volume_of(workspace.cell), volume_of(state.cell)
+    work = target_pressure(barostat.pressure, state, 0) * (after - before)
+    work = energy_gained(barostat, model, state, workspace) + work
+    return barostat.molecules * log(after / before) - work / ramp_value(
+        barostat.thermal_energy, state
+    )
