@@ -14,17 +14,26 @@ Examples
     results = rigidmd.read_run("runs/water")  # of an earlier run
 """
 
+from importlib import import_module
+
 import lazy_loader
 
 from rigidmd.core.display import PROVIDERS
+from rigidmd.features import FEATURES
 
 # Public names are loaded at first use, so that `rigidmd --help` need not wait for Numba.
 _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
-PROVIDERS += ["rigidmd.view.notebook", "rigidmd.studies.sweep.notebook"]
+PROVIDERS += [
+    f"{row.package}.{row.display}" for row in FEATURES if row.display and row.is_installed
+]
+#: Public names that are modules of features.
+PACKAGES = {"analysis": "analysis.analysis", "view": "view"}
 
 
 def __getattr__(name: str) -> object:
+    if name in PACKAGES:
+        return import_module(f"rigidmd.features.{PACKAGES[name]}")
     if name == "__version__":
         from importlib.metadata import version
 

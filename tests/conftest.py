@@ -68,7 +68,7 @@ def printed(capsys):
 def no_analysis_outlives_its_test():
     """Examples of the documentation register analyses, and a worker runs many files."""
     yield
-    registry = sys.modules.get("rigidmd.analysis.registry")
+    registry = sys.modules.get("rigidmd.features.analysis.registry")
     for name in (
         [name for name, entry in registry.KNOWN.items() if entry.is_user] if registry else ()
     ):
@@ -106,7 +106,7 @@ def figures_are_empty_where_none_is_tested(request, monkeypatch):
     """Their axes are made and their files are written, but to draw one takes 0.4 s."""
     file = request.path.relative_to(ROOT / "tests").as_posix()
     if not file.startswith(DRAWN) and "draws" not in request.fixturenames:
-        from rigidmd.figures.picture import Picture
+        from rigidmd.features.view.figures.picture import Picture
 
         monkeypatch.setattr(Picture, "lay_out", lambda figure, dpi: None)
         monkeypatch.setattr(Picture, "data", lambda figure, kind, *_, **options: EMPTY[kind])

@@ -9,7 +9,6 @@ from importlib import import_module
 from math import inf
 from typing import NamedTuple
 
-from rigidmd.assemble.coupling import at_lambda, coupled
 from rigidmd.assemble.defaults import with_momentum_removal
 from rigidmd.assemble.memory_check import check_memory
 from rigidmd.assemble.resolve import ResolvedScene, resolve
@@ -23,6 +22,7 @@ from rigidmd.dynamics.noise import BAROSTAT, THERMOSTAT, key_of
 from rigidmd.dynamics.thermostats import Ramp
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, StructureError
+from rigidmd.features.free_energy.coupling import at_lambda, coupled
 from rigidmd.forces.neighbors.space import Space
 from rigidmd.forces.parts import Interactions, SystemParts, sum_of_tails
 from rigidmd.forces.terms import trait
@@ -48,7 +48,7 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     if user_code:
         system = _with_user_code(system)
     elif system.scene.forces.bodies:
-        from rigidmd.assemble.user_code.body_pairs import potentials_of_stored_run
+        from rigidmd.features.potentials.user_code.body_pairs import potentials_of_stored_run
 
         system = replace(system, body_pairs=potentials_of_stored_run(system.scene))
     if errors := _ensemble_errors(system):
@@ -113,7 +113,9 @@ def _with_user_code(system: System) -> System:
         )
     if not (scene.forces.added or scene.from_python):
         return system
-    from rigidmd.assemble.user_code.binding import with_user_code  # for these scenes only
+    from rigidmd.features.potentials.user_code.binding import (
+        with_user_code,  # for these scenes only
+    )
 
     return with_user_code(system)
 

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.body import build_body
 from rigidmd.assemble.build import build
 from rigidmd.assemble.memory_check import bytes_of
 from rigidmd.assemble.stage_description import describe_stage
@@ -16,9 +15,10 @@ from rigidmd.assemble.time_step import MIXED_ERROR, describe_step
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import edges_and_angles
-from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
+from rigidmd.features.bodies.assemble import build_body
+from rigidmd.features.bodies.system import BodySystem
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.space import cell_of
 from rigidmd.forces.potentials.coulomb import ReactionField

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.coupling import with_coupling
 from rigidmd.assemble.defaults import with_defaults, with_engine_defaults, without_tail_reason
 from rigidmd.assemble.plausibility import scene_errors, scene_warnings
 from rigidmd.assemble.species import species_of, split_frozen
@@ -17,6 +16,7 @@ from rigidmd.assemble.time_step import with_time_steps
 from rigidmd.core.state import state_of
 from rigidmd.dynamics.model import Model
 from rigidmd.errors import SceneError
+from rigidmd.features.free_energy.coupling import with_coupling
 from rigidmd.forces.neighbors.space import Orthorhombic, Space, cell_of, space_of
 from rigidmd.forces.parts import Composition, SystemParts
 from rigidmd.formats.cells import describe_basis, describe_cell

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 
-from rigidmd.assemble.body import build_body
 from rigidmd.assemble.build import build
 from rigidmd.core.toml import Json, plain_values
 from rigidmd.errors import RigidMDWarning, SceneError
+from rigidmd.features.bodies.assemble import build_body
 from rigidmd.formats import STRUCTURE
 from rigidmd.formats.cells import cell_error
 from rigidmd.formats.through_ase import NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS, atoms_of_system

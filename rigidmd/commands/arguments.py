@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple, TypedDict, TypeVar, Unpack
 
 from rigidmd.commands.streams import progress_bar
-from rigidmd.programs import engine_options, runnable
+from rigidmd.features.external.programs import engine_options, runnable
 
 #: Adds an argument to the parser of a command.
 Argument = Callable[[argparse.ArgumentParser], object]
@@ -175,7 +175,7 @@ def read_scene(options: Options, **more):
     from rigidmd.scene import Scene, parse_override
 
     if options.trust:
-        from rigidmd.assemble.user_code.trust import check_trusted, trust
+        from rigidmd.features.potentials.user_code.trust import check_trusted, trust
 
         for path in options.trust:
             trust(path)

@@ -32,7 +32,7 @@ def _check(options: Options) -> int:
 
     scene = read_scene(options)
     if isinstance(scene, BodyScene):
-        from rigidmd.assemble.body import build_body
+        from rigidmd.features.bodies.assemble import build_body
         from rigidmd.run.stable_step import body_step_warnings
 
         if options.program or options.profile:
@@ -46,7 +46,7 @@ def _check(options: Options) -> int:
     else:
         from rigidmd.assemble.build import build
         from rigidmd.assemble.time_step import step_warnings
-        from rigidmd.engines.external import check_engine
+        from rigidmd.features.external.engines import check_engine
 
         system = build(scene)
         print(describe_system(system))

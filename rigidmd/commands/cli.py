@@ -1,8 +1,8 @@
 """`rigidmd`: the parsing of the command line, the messages and exit codes of errors.
 
-The module of the command is imported, or without one all modules of this package. Their functions
-with the decorator `command` are the commands. They compute nothing. Modules import what they need
-inside functions, so that `rigidmd --help` loads none of it.
+The module of the command is imported, or without one all modules of this package and of features.
+Their functions with the decorator `command` are the commands. They compute nothing. Modules import
+what they need inside functions, so that `rigidmd --help` loads none of it.
 """
 
 import argparse
@@ -22,6 +22,8 @@ from rigidmd.commands.arguments import COMMANDS
 from rigidmd.commands.streams import checked_streams, open_streams, warn
 from rigidmd.core.plain_text import did_you_mean
 from rigidmd.errors import RigidMDError, RigidMDWarning, SimulationError, Wording, worded_by
+from rigidmd.feature import modules
+from rigidmd.features import FEATURES
 
 EXAMPLES = """examples:
   rigidmd new water                         copy a scene to start from: water.toml
@@ -162,9 +164,10 @@ def _parser(first: str = "") -> tuple[argparse.ArgumentParser, dict[str, argpars
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    names = [module.name for module in iter_modules(package.__path__)]
-    for name in [first] if first in names else names:
-        import_module(f"{package.__name__}.{name}")
+    names = {m.name: f"{package.__name__}.{m.name}" for m in iter_modules(package.__path__)}
+    names |= modules(FEATURES, "commands")
+    for name in [names[first]] if first in names else names.values():
+        import_module(name)
     for name, command in sorted(COMMANDS.items(), key=lambda item: item[1].position):
         description = command.about[0].upper() + command.about[1:] + "."
         epilog = f"example:\n  {command.example}"

@@ -51,8 +51,12 @@ from rigidmd.errors import MoleculeError
 )
 def _models(options: Options) -> int:
     from rigidmd.assemble.plausibility import molecule_warnings
+    from rigidmd.features.view.molecule_figure import (
+        models_table,
+        molecule_text,
+        write_molecule_figure,
+    )
     from rigidmd.scene.models import available_models, load_model, read_molecule
-    from rigidmd.view.molecule_figure import models_table, molecule_text, write_molecule_figure
 
     if options.geometry is not None:
         return _write_model(options)

@@ -1,7 +1,6 @@
 """Display of values in notebooks. Packages above register functions for values of packages below.
 
-A module in `PROVIDERS` is imported when a value is first displayed. `rigidmd` names
-`rigidmd.view.notebook`.
+A module in `PROVIDERS` is imported when a value is first displayed. They are those of features.
 """
 
 from functools import singledispatch

@@ -47,7 +47,6 @@ from rigidmd.dynamics.force_gradient import (
     load_of_kick,
     needs_forces,
 )
-from rigidmd.dynamics.hybrid_monte_carlo import TrajectoryWorkspace, trajectory_passes
 from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.observables import (
     SUM_COUNT,
@@ -67,6 +66,7 @@ from rigidmd.dynamics.registers import (
     new_registers,
 )
 from rigidmd.dynamics.thermostats import thermostat_code, thermostat_pass
+from rigidmd.features.monte_carlo.trajectories import TrajectoryWorkspace, trajectory_passes
 from rigidmd.forces.neighbors.sites import blocks_of, molecules_of_block
 from rigidmd.forces.terms import FORCES_ONLY, WITH_ENERGIES, TermTable, total_energy_rate
 from rigidmd.mechanics.batches import LANES, kick_group, rotate_group

@@ -14,11 +14,11 @@ from rigidmd.dynamics.model import DegreesOfFreedom, Model, mobile
 from rigidmd.engines.cpu.engine import CpuEngine, Precision
 from rigidmd.engines.samples import OF_TRAJECTORIES, lambda_column
 from rigidmd.engines.sites import Sites
+from rigidmd.features.potentials.poses.potential import BodyPairPotential
 from rigidmd.forces.fields.distances import DistanceRestraint
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.space import Space, space_of, wrap
 from rigidmd.forces.parts import Interactions, Tail, gather_per_molecule
-from rigidmd.forces.poses.potential import BodyPairPotential
 from rigidmd.forces.terms import trait
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import Molecule

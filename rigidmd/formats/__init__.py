@@ -1,7 +1,8 @@
 """File formats of structures and trajectories: a module here registers its formats, and states
 everything about them.
 
-No other code of rigidmd names an extension. A module in this folder is found by being there.
+No other code of rigidmd names an extension. A module in this folder is found by being there, and
+features list theirs.
 `register` adds a format from outside.
 """
 
@@ -15,6 +16,8 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
+from rigidmd.feature import modules
+from rigidmd.features import FEATURES
 from rigidmd.formats.atoms import Atoms, Frame
 from rigidmd.formats.systems import System
 
@@ -127,9 +130,11 @@ def register(form: Format) -> None:
 
 
 def find_modules() -> None:
-    """Import all modules in the folders of this package, which register their formats."""
-    for module in iter_modules(__path__, f"{__name__}."):
-        import_module(module.name)
+    """Import the modules of this package and of features, which register their formats."""
+    names = {module.name: f"{__name__}.{module.name}" for module in iter_modules(__path__)}
+    names |= modules(FEATURES, "formats")
+    for _, name in sorted(names.items()):
+        import_module(name)
 
 
 def format_of(path: str | Path) -> Format | None:

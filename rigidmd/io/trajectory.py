@@ -20,9 +20,9 @@ from MDAnalysis.lib.distances import minimize_vectors, self_capped_distance
 
 from rigidmd.core.process import ignore_warnings
 from rigidmd.core.state import State
-from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError, StructureError
+from rigidmd.features.bodies.system import BodySystem
 from rigidmd.formats import BY_EXTENSION
 from rigidmd.formats.atoms import Frame
 from rigidmd.formats.bonds import charges, connections

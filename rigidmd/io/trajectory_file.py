@@ -18,8 +18,8 @@ from rigidmd.formats.frame_file import FrameFile
 from rigidmd.scene.validation import not_none
 
 if TYPE_CHECKING:
-    from rigidmd.engines.body_system import BodySystem
     from rigidmd.engines.system import System
+    from rigidmd.features.bodies.system import BodySystem
 
 #: Formats of trajectories that hold any positions at any times.
 UNLIMITED = written(lambda form: form.encoder and form.limits == (-inf, inf) and not form.even)

@@ -211,7 +211,10 @@ def within_table(system: System, state: State) -> str:
         first = getattr(potential.function, "first", 0.0)
         if not first:
             continue
-        from rigidmd.forces.poses.pairs import BodyPairs, reference_points  # for such scenes only
+        from rigidmd.features.potentials.poses.pairs import (  # for such scenes only
+            BodyPairs,
+            reference_points,
+        )
 
         term = cast(BodyPairs, system.terms[name])
         bodies, point = reference_points(term, state)

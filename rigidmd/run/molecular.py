@@ -13,8 +13,6 @@ from rigidmd.assemble.build import build, integrator_of_stage
 from rigidmd.assemble.harmonic import stable_angle
 from rigidmd.assemble.start import rest_errors
 from rigidmd.assemble.time_step import accuracy_warnings
-from rigidmd.assemble.user_code.binding import user_errors_explained
-from rigidmd.assemble.user_code.compiled import check_compiled_code
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import NOW, ORIGIN, REMOVED, State, state_of
@@ -26,6 +24,8 @@ from rigidmd.engines.protocol import Engine, NotFiniteError
 from rigidmd.engines.samples import OF_TRAJECTORIES, Samples
 from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SceneError, SimulationError, StructureError
+from rigidmd.features.potentials.user_code.binding import user_errors_explained
+from rigidmd.features.potentials.user_code.compiled import check_compiled_code
 from rigidmd.formats import format_of
 from rigidmd.formats.through_ase import atoms_of_system
 from rigidmd.io.checkpoint import Checkpoint
@@ -161,7 +161,11 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
     def prepare(self) -> None:
         """Remove overlaps, and compile the steps, or compare the start with an external engine."""
         if self.scene.engine.is_external:
-            from rigidmd.engines.external import compare_at, describe_comparison, external_engine
+            from rigidmd.features.external.engines import (
+                compare_at,
+                describe_comparison,
+                external_engine,
+            )
 
             # first: the error of a missing program comes before compilation
             other = external_engine(self.system)
@@ -274,7 +278,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         """The engine of stage k. Minimisations are always by rigidmd."""
         if not self.scene.engine.is_external or self.scene.stages[k].is_minimisation:
             return self.system.engine()
-        from rigidmd.engines.external import external_engine
+        from rigidmd.features.external.engines import external_engine
 
         other = external_engine(self.system, k)
         self.engine_version = other.version

@@ -264,8 +264,8 @@ class Figures(Observer):
         self._names = [f"{stem}.{suffix}" for stem in stems for suffix in suffixes]
 
     def end(self, run: "Simulation", results: "Results") -> None:
-        from rigidmd.figures.run import run_figures
-        from rigidmd.figures.style import save_files
+        from rigidmd.features.view.figures.run import run_figures
+        from rigidmd.features.view.figures.style import save_files
 
         failed = None
         for stem, figure in run_figures(run.system, results.samples, results.summary).items():

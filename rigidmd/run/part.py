@@ -20,11 +20,11 @@ from rigidmd.run.resume import RunRecord, restored
 from rigidmd.run.schedule import Segment
 
 if TYPE_CHECKING:
-    from rigidmd.engines.body_motion import Motion
-    from rigidmd.engines.body_system import BodySystem, Pose
     from rigidmd.engines.observables import Observation
     from rigidmd.engines.samples import Samples
     from rigidmd.engines.system import System
+    from rigidmd.features.bodies.motion import Motion
+    from rigidmd.features.bodies.system import BodySystem, Pose
     from rigidmd.run.results import Results
     from rigidmd.run.simulation import Simulation
 

@@ -9,16 +9,16 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from rigidmd.assemble.body import build_body
 from rigidmd.assemble.build import build
 from rigidmd.core.state import State
 from rigidmd.core.toml import Json
 from rigidmd.engines import samples
-from rigidmd.engines.body_motion import Snapshot, motion
-from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.samples import BODY, BODY_COLUMNS
 from rigidmd.engines.system import System
 from rigidmd.errors import CheckpointError, OutputError
+from rigidmd.features.bodies.assemble import build_body
+from rigidmd.features.bodies.motion import Snapshot, motion
+from rigidmd.features.bodies.system import BodySystem
 from rigidmd.io.checkpoint import latest
 from rigidmd.io.folder import LOG, MOTION, SCENE, SUMMARY, check_is_run
 from rigidmd.io.run_files import Summary, read_columns, read_json, read_motion

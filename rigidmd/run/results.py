@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     import MDAnalysis
     import pandas
 
-    from rigidmd.engines.body_motion import Motion
-    from rigidmd.engines.body_system import BodySystem
     from rigidmd.engines.samples import Samples
     from rigidmd.engines.system import System
+    from rigidmd.features.bodies.motion import Motion
+    from rigidmd.features.bodies.system import BodySystem
     from rigidmd.formats.atoms import Frame
 
 
@@ -179,7 +179,7 @@ class Results(Displayed):
         IndexError
             If there are fewer frames.
         """
-        from rigidmd.run.atom_forces import atoms_of_results
+        from rigidmd.features.calculators.atom_forces import atoms_of_results
 
         return atoms_of_results(self, frame)
 

@@ -48,13 +48,13 @@ from rigidmd.scene import BodyScene, Scene
 if TYPE_CHECKING:
     import ase
 
-    from rigidmd.assemble.user_code.force import Force, HasStage, HasTerm
-    from rigidmd.assemble.user_code.pair_potential import PairPotential
-    from rigidmd.engines.body_system import BodySystem, Pose
     from rigidmd.engines.observables import Observation
     from rigidmd.engines.protocol import Engine
     from rigidmd.engines.system import System
-    from rigidmd.run.body import BodyRun
+    from rigidmd.features.bodies.run import BodyRun
+    from rigidmd.features.bodies.system import BodySystem, Pose
+    from rigidmd.features.potentials.user_code.force import Force, HasStage, HasTerm
+    from rigidmd.features.potentials.user_code.pair_potential import PairPotential
     from rigidmd.run.minimise import OverlapRemoval
     from rigidmd.run.molecular import MolecularRun
     from rigidmd.scene import MolecularScene
@@ -221,7 +221,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         )
         of_molecules = {"forces": forces, "thermostat": thermostat}
         if isinstance(scene, BodyScene):
-            from rigidmd.run.body import BodyRun
+            from rigidmd.features.bodies.run import BodyRun
 
             if set_keys := [key for key, value in of_molecules.items() if value is not None]:
                 problem = (

@@ -9,9 +9,9 @@ import numpy as np
 from rigidmd.assemble.harmonic import INACCURATE, stable_angle, step_error
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import Load, State
-from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.protocol import Engine
-from rigidmd.forces.body.applied import SteadyForce
+from rigidmd.features.bodies.forces.applied import SteadyForce
+from rigidmd.features.bodies.system import BodySystem
 from rigidmd.mechanics.free_rotor import SplitRotor
 from rigidmd.mechanics.rotation import from_vector
 

@@ -8,17 +8,17 @@ from math import inf
 
 import numpy as np
 
-from rigidmd.assemble.body import build_body
 from rigidmd.assemble.time_step import error_of_step, precision_for
 from rigidmd.core.integrators import FORMULATIONS, SCHEMES, SOLVERS, Scheme, Solver
 from rigidmd.core.state import State
-from rigidmd.engines.body_motion import Snapshot, motion
-from rigidmd.engines.body_system import Pose
 from rigidmd.engines.observables import observe
-from rigidmd.engines.ode.rates import SMALLEST_SINE
 from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
+from rigidmd.features.bodies.assemble import build_body
+from rigidmd.features.bodies.motion import Snapshot, motion
+from rigidmd.features.bodies.ode.rates import SMALLEST_SINE
+from rigidmd.features.bodies.system import Pose
 from rigidmd.run.trials import Method, TrialSystem
 from rigidmd.scene import BodyScene
 from rigidmd.units import BOLTZMANN, FEMTOSECOND

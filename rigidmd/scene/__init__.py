@@ -2,8 +2,8 @@
 
 from typing import TYPE_CHECKING, TypeGuard
 
+from rigidmd.features.bodies.keys.body import BodyScene
 from rigidmd.scene.base import Scene, parse_override
-from rigidmd.scene.body import BodyScene
 
 if TYPE_CHECKING:
     from rigidmd.scene.json_schema import schema

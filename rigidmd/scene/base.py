@@ -51,7 +51,7 @@ from rigidmd.scene.validation import (
 )
 
 if TYPE_CHECKING:
-    from rigidmd.scene.body import BodyScene
+    from rigidmd.features.bodies.keys.body import BodyScene
     from rigidmd.scene.molecules import MolecularScene
 
     KindOfScene = type[MolecularScene] | type[BodyScene]
@@ -438,7 +438,7 @@ def file_name(wanted: Callable[[Format], object]) -> AfterValidator:
 
 def _kind_of_scene(data: dict) -> "KindOfScene | None":
     """The class of scenes with these tables. None if no table belongs to either class."""
-    from rigidmd.scene.body import BodyScene
+    from rigidmd.features.bodies.keys.body import BodyScene
 
     if "body" in data:
         return BodyScene

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import Field, create_model
 
 from rigidmd.core.toml import Json
-from rigidmd.programs import Program, engine_options, runnable
+from rigidmd.features.external.programs import Program, engine_options, runnable
 from rigidmd.scene.validation import Count, Section
 
 RIGIDMD = "rigidmd"

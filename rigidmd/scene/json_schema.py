@@ -9,7 +9,7 @@ from pydantic.json_schema import (
 )
 
 from rigidmd.core.toml import Json
-from rigidmd.scene.body import BodyScene
+from rigidmd.features.bodies.keys.body import BodyScene
 from rigidmd.scene.models import available_models
 from rigidmd.scene.molecules import MolecularScene
 

@@ -10,9 +10,9 @@ from pydantic import Field, PrivateAttr, Strict
 from rigidmd.core.plain_text import distinct
 from rigidmd.core.toml import Json
 from rigidmd.errors import SceneError, option
+from rigidmd.features.free_energy.keys import Coupling
 from rigidmd.formats import BY_EXTENSION, TOPOLOGIES, TOPOLOGY, TRAJECTORY, format_of, written
 from rigidmd.scene.base import Scene, file_name, is_inside
-from rigidmd.scene.coupling import Coupling
 from rigidmd.scene.couplings import default_interval
 from rigidmd.scene.engine import EngineChoice
 from rigidmd.scene.fields import Fields, field_errors
@@ -34,7 +34,7 @@ from rigidmd.scene.validation import (
 
 
 class UserCode(NamedTuple):
-    """Forces and a thermostat, from which `rigidmd.assemble.user_code` makes terms."""
+    """Forces and a thermostat, from which `rigidmd.features.potentials.user_code` makes terms."""
 
     forces: tuple[object, ...] = ()
     thermostat: object = None

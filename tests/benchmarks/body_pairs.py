@@ -27,7 +27,7 @@ from rigidmd.assemble.build import build
 from rigidmd.assemble.build import integrator_of_stage as row
 from rigidmd.core.state import State
 from rigidmd.engines.system import System
-from rigidmd.forces.poses.gay_berne import PARAMETERS, GayBerne
+from rigidmd.features.potentials.poses.gay_berne import PARAMETERS, GayBerne
 
 STEP, MELTING = 5.0, 10 if SMOKE else 1000  # fs, steps before the measurement
 TWICE = REPEAT if SMOKE else [2 * count for count in REPEAT]

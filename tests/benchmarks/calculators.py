@@ -26,8 +26,8 @@ from command_line import SMOKE, new_parser, read_options
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from rigidmd import Simulation, scene_from_atoms
-from rigidmd.ase import CalculatorForce
-from rigidmd.figures.style import INK, new_figure, open_axis
+from rigidmd.features.calculators.calculator import CalculatorForce
+from rigidmd.features.view.figures.style import INK, new_figure, open_axis
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 TEMPERATURE, DURATION, INTERVAL = 200.0, 0.024 if SMOKE else 2.0, 0.012  # K, ps, ps

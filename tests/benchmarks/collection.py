@@ -102,8 +102,8 @@ def data_of(docs: Path) -> Path:
 
 def measure(name: str, docs: Path) -> None:
     """Measure a scene and write its table, picture and advice."""
+    from rigidmd.features.studies.accuracy import accuracy
     from rigidmd.scene import Scene, parse_override
-    from rigidmd.studies.accuracy import accuracy
 
     _, file, settings = SCENES[name]
     if SMOKE and "top" not in file:

@@ -15,7 +15,7 @@ from support.common import small_scene
 from support.scenes import SCENES
 
 from rigidmd.errors import RigidMDError
-from rigidmd.studies.other_engines import verify
+from rigidmd.features.external.verify import verify
 
 
 def print_table(engine: str) -> None:

@@ -14,9 +14,9 @@ from pathlib import Path
 from command_line import SMOKE, new_parser, read_options
 
 from rigidmd import Scene, Simulation
-from rigidmd.figures.style import new_figure, save_files
+from rigidmd.features.view.figures.style import new_figure, save_files
+from rigidmd.features.view.molecule_animation import MoleculeAnimation
 from rigidmd.run.record import read_record
-from rigidmd.view.molecule_animation import MoleculeAnimation
 
 ROOT = Path(__file__).parents[2]
 IMAGES = ROOT / "rigidmd" / "docs" / "images"

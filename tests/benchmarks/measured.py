@@ -16,7 +16,7 @@ from command_line import SMOKE, new_parser, read_options
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from rigidmd import Scene, Simulation
-from rigidmd.analysis.files import analyse_folder
+from rigidmd.features.analysis.files import analyse_folder
 
 TEMPERATURE = 298.15
 

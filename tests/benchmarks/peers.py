@@ -61,7 +61,7 @@ from rigidmd import Scene, Simulation
 from rigidmd.assemble.build import build
 from rigidmd.compile.cache import cache_folder
 from rigidmd.core.statistics import slope
-from rigidmd.figures.style import FAINT, INK
+from rigidmd.features.view.figures.style import FAINT, INK
 from rigidmd.forces.ewald.corrections import intramolecular_energy
 from rigidmd.mechanics.rotation import align
 from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL

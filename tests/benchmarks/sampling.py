@@ -56,8 +56,8 @@ from scipy.spatial import cKDTree
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from rigidmd import Every, Scene, Simulation
 from rigidmd.errors import RigidMDError
-from rigidmd.figures.style import FAINT, INK
-from rigidmd.studies.extrapolation import MeanAtStep, extrapolate
+from rigidmd.features.studies.extrapolation import MeanAtStep, extrapolate
+from rigidmd.features.view.figures.style import FAINT, INK
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 COUNT = 343 if SMOKE else 512

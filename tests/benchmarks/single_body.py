@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from support import known
 
 from rigidmd.core.integrators import SCHEMES, Solver
-from rigidmd.engines.ode.engine import OdeEngine
+from rigidmd.features.bodies.ode.engine import OdeEngine
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 

@@ -20,8 +20,8 @@ import numpy as np
 from command_line import SMOKE, new_parser, read_options
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from rigidmd.analysis.built_in.interfaces import BIN, fitted
 from rigidmd.core.statistics import mean_and_error
+from rigidmd.features.analysis.built_in.interfaces import BIN, fitted
 from rigidmd.units import GRAM_PER_CM3
 
 SCENE = Path(__file__).parents[2] / "systems" / "water_slab.toml"

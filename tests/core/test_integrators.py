@@ -10,7 +10,6 @@ from support.scenes import NPT, NVT, PINNED, forty_waters
 from support.stops import same_after_stops
 
 import rigidmd
-from rigidmd.assemble.body import build_body
 from rigidmd.assemble.build import build
 from rigidmd.commands.cli import main
 from rigidmd.core.integrators import (
@@ -24,9 +23,10 @@ from rigidmd.core.integrators import (
     split,
 )
 from rigidmd.errors import SceneError
+from rigidmd.features.bodies.assemble import build_body
+from rigidmd.features.studies.accuracy.accuracy import measure_accuracy
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene, integrators
-from rigidmd.studies.accuracy.accuracy import measure_accuracy
 
 CHIN_B = (1 - 3**-0.5) / 2, 3**-0.5, (2 - 3**0.5) / 12  # Chin 1997, scheme B: drifts, gradient
 #: Name -> order, kicks, drifts and gradients. The sums over a row of fraction times gradient are those

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from support.common import ROOT, built, move, same_bits, small_scene
 
-from rigidmd.assemble.body import build_body
 from rigidmd.core.integrators import SCHEMES, Solver
 from rigidmd.core.state import HEAT, NOW, ORIGIN, state_of
 from rigidmd.core.state_file import read_state, write_state
@@ -13,6 +12,7 @@ from rigidmd.dynamics.noise import THERMOSTAT, key_of
 from rigidmd.dynamics.thermostats import constant_ramp
 from rigidmd.dynamics.thermostats.velocity_rescaling import VelocityRescaling
 from rigidmd.errors import StructureError
+from rigidmd.features.bodies.assemble import build_body
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 from rigidmd.units import BOLTZMANN

@@ -17,9 +17,9 @@ from rigidmd.core.statistics import (
     steady_from,
 )
 from rigidmd.core.statistics import mean_and_error as mean
+from rigidmd.features.studies.accuracy.averages import AveragedQuantity, AverageRun, Averages
+from rigidmd.features.studies.accuracy.averages_report import brief_table, describe_failures
 from rigidmd.run.summary import drift_of_thermostats
-from rigidmd.studies.accuracy.averages import AveragedQuantity, AverageRun, Averages
-from rigidmd.studies.accuracy.averages_report import brief_table, describe_failures
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 SERIES = 400

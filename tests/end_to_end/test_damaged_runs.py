@@ -11,14 +11,14 @@ import pytest
 from support.common import ROOT
 
 from rigidmd import Scene, Simulation
-from rigidmd.analysis.files import ANALYSIS, read_results
 from rigidmd.commands import cli
 from rigidmd.errors import OutputError, RigidMDError
+from rigidmd.features.analysis.files import ANALYSIS, read_results
+from rigidmd.features.studies.compare import compare, describe_run_comparison
+from rigidmd.features.studies.sweep.folder import Manifest, SweepPoint, read_manifest
+from rigidmd.features.view.run_page import write_report
 from rigidmd.io.run_files import Summary, read_json
 from rigidmd.run.record import read_record
-from rigidmd.studies.compare import compare, describe_run_comparison
-from rigidmd.studies.sweep.folder import Manifest, SweepPoint, read_manifest
-from rigidmd.view.run_page import write_report
 
 DEEP = "[" * 5000 + "]" * 5000
 #: What a value of a file of JSON becomes, as text.

@@ -16,10 +16,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigidmd.ase import RigidMD
 from rigidmd.commands.cli import main
 from rigidmd.core.state import State
 from rigidmd.errors import RigidMDError
+from rigidmd.features.calculators.calculator import RigidMD
 from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene

@@ -16,12 +16,13 @@ from support.common import small_scene
 from support.scenes import FORTY_WATERS, NVT, forty_waters
 
 from rigidmd import formats
-from rigidmd.analysis.rigid_frames import without_rounding
 from rigidmd.assemble.build import build
 from rigidmd.assemble.structure import read_structure
 from rigidmd.core.process import ignore_warnings
 from rigidmd.core.state import NO_CELL, edges_and_angles
 from rigidmd.errors import SceneError, SimulationError, StructureError
+from rigidmd.features.analysis.rigid_frames import without_rounding
+from rigidmd.features.external.verify import export
 from rigidmd.formats import BY_EXTENSION, Topology, through_mdanalysis
 from rigidmd.formats.atoms import Frame
 from rigidmd.io.structure_file import read_atoms, read_geometry
@@ -36,7 +37,6 @@ from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 from rigidmd.scene.models import load_model
-from rigidmd.studies.other_engines import export
 
 TEXT = """
 [structure]

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import elliprd
 from support.common import ROOT
 
-from rigidmd.assemble.body import build_body
+from rigidmd.features.bodies.assemble import build_body
 from rigidmd.mechanics.inertia import COMPONENTS_PER_DIMENSION as NUMBERS
 from rigidmd.mechanics.inertia import SOLIDS, added_mass_of_ellipsoid, inertia_tensor, solid
 from rigidmd.scene import Scene

@@ -12,6 +12,7 @@ import tomllib
 import pytest
 from support.common import ROOT
 
+from rigidmd.features import FEATURES
 from rigidmd.formats import BY_EXTENSION
 
 PACKAGE = ROOT / "rigidmd"
@@ -20,46 +21,50 @@ PACKAGE = ROOT / "rigidmd"
 LAYERS = (
     "errors",
     "units",
+    "feature",
+    "features",  # the list of features
     "core",
     "compile",
     "mechanics",
     "formats",
-    "programs",
     "scene",
     "forces",
     "dynamics",
     "engines",
     "io",
-    "figures",
     "assemble",
     "run",
-    "analysis",
-    "view",
-    "studies",
-    "ase",
     "commands",
 )
-#: `rigidmd` itself and `python -m rigidmd` are above all packages.
-ABOVE_ALL = ("__init__", "__main__")
-RANK = {name: rank for rank, name in enumerate((*LAYERS, *ABOVE_ALL))}
+#: The layer of features. `rigidmd` itself and `python -m rigidmd` are above all packages.
+ABOVE_THE_CORE = "a feature"
+ABOVE_ALL = ("ase", "__init__", "__main__")
+RANK = {name: rank for rank, name in enumerate((*LAYERS, ABOVE_THE_CORE, *ABOVE_ALL))}
+NAMES = {row.name: row for row in FEATURES}
 
 #: Library -> the packages and files that import it.
 LIBRARIES = {
-    "ase": {"formats", "io", "assemble", "run", "ase.py"},
-    "chemiscope": {"view"},
-    "distributed": {"studies/sweep"},
-    "gsd": {"formats"},
+    "ase": {"formats", "io", "assemble", "run", "features/calculators", "features/crystals"},
+    "chemiscope": {"features/view"},
+    "distributed": {"features/studies/sweep"},
+    "gsd": {"features/crystals"},
     "IPython": {"io/progress.py"},
     "llvmlite": {"compile"},
     "MDAnalysis": {"formats", "io", "run/results.py"},
-    "matplotlib": {"figures", "analysis/files.py", "view", "studies"},
-    "numba": {"compile", "forces"},
+    "matplotlib": {"features"},
+    "numba": {
+        "compile",
+        "forces",
+        "features/potentials",
+        "features/free_energy",
+        "features/bodies",
+    },
     "numba.core": {"compile"},
     "numba.extending": {"compile"},
-    "openmm": {"engines/openmm"},
-    "pydantic": {"scene", "io", "run", "analysis/files.py", "studies/sweep"},
+    "openmm": {"features/external/openmm"},
+    "pydantic": {"scene", "io", "run", "features"},
     "rocket_fft": {"forces/ewald/pme.py"},
-    "sympy": {"forces/potentials/text_formulas.py", "engines/force_field.py"},
+    "sympy": {"features/potentials/sites/text_formulas.py", "features/external/force_field.py"},
     "tomli_w": {"io/scene_file.py"},
 }
 
@@ -73,12 +78,26 @@ def name_of(path):
 
 
 def layer_of(module):
-    """The package of a module; "" is `rigidmd` itself."""
-    return (module or "__init__").partition(".")[0]
+    """The layer of a module below rigidmd: "" is `rigidmd` itself; one of a feature is above the
+    core, but its keys belong to `scene`."""
+    first, _, rest = (module or "__init__").partition(".")
+    if first != "features" or rest in ("", "__init__"):
+        return first
+    return "scene" if rest.split(".")[1:2] == ["keys"] else ABOVE_THE_CORE
+
+
+def feature_of(module):
+    """The feature of a module below rigidmd. Empty for the core."""
+    name = module.removeprefix("features.").partition(".")[0]
+    return name if module.startswith("features.") and name in NAMES else ""
+
+
+def module_of(path):
+    return ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__")
 
 
 def package_of(path):
-    return layer_of(".".join(path.relative_to(PACKAGE).with_suffix("").parts))
+    return layer_of(module_of(path))
 
 
 def imports_in(source):
@@ -114,14 +133,64 @@ def upward(package, found):
             yield f"{line}: imports {module}: {package} is below {other.replace('__init__', 'rigidmd')}"
 
 
+#: Files of the core that import a feature.
+REACHING_UP = (
+    "assemble/build.py",
+    "assemble/describe.py",
+    "assemble/resolve.py",
+    "assemble/scenes.py",
+    "commands/arguments.py",
+    "commands/check.py",
+    "commands/models.py",
+    "dynamics/step_loop.py",
+    "engines/cpu/compiled.py",
+    "engines/cpu/engine.py",
+    "engines/system.py",
+    "forces/potentials/lennard_jones.py",
+    "io/trajectory.py",
+    "io/trajectory_file.py",
+    "run/checks.py",
+    "run/molecular.py",
+    "run/observers.py",
+    "run/part.py",
+    "run/pilot/sampling.py",
+    "run/pilot/stages.py",
+    "run/record.py",
+    "run/results.py",
+    "run/simulation.py",
+    "run/stable_step.py",
+    "run/trial_systems.py",
+    "scene/engine.py",
+)
+
+
 def test_imports_point_down():
     """Imports inside functions and for type checkers count. The order of layers excludes circles of
-    packages."""
+    packages, and imports of a feature by the core."""
     assert not [name_of(path) for path in FILES if package_of(path) not in RANK], "in no layer"
     errors = [
         f"{name_of(path)}:{message}"
         for path in FILES
         for message in upward(package_of(path), imports(path))
+        if name_of(path) not in REACHING_UP
+    ]
+    assert not errors, "\n".join(errors)
+    assert not [name for name in REACHING_UP if not list(upward_of(name))], "no more reach up"
+
+
+def upward_of(name):
+    path = PACKAGE / name
+    return upward(package_of(path), imports(path))
+
+
+def test_a_feature_imports_those_that_it_needs():
+    errors = [
+        f"{name_of(path)}:{line}: {name} does not need {other}"
+        for path in FILES
+        if (name := feature_of(module_of(path)))
+        for line, module in imports(path)
+        if (other := feature_of(module.removeprefix("rigidmd."))) not in ("", name)
+        and other not in NAMES[name].needs
     ]
     assert not errors, "\n".join(errors)
 
@@ -132,7 +201,7 @@ from typing import TYPE_CHECKING
 import numpy
 from rigidmd.core.state import State
 if TYPE_CHECKING:
-    from rigidmd.view.plots import plot
+    from rigidmd.features.view.plots import plot
 def build():
     from rigidmd import run
     import rigidmd.assemble.build
@@ -173,10 +242,13 @@ COMPILED = (
     "mechanics",
     "forces",
     "dynamics",
-    "analysis/pair_histogram.py",
     "engines/protocol.py",
     "engines/cpu",
-    "engines/ode",
+    "features/analysis/pair_histogram.py",
+    "features/bodies",
+    "features/free_energy",
+    "features/monte_carlo",
+    "features/potentials",
 )
 ASKED_BY_OTHERS = {"rigidmd.compile.machine", "rigidmd.compile.cache", "rigidmd.compile.sources"}
 
@@ -192,10 +264,10 @@ def test_only_packages_of_kernels_compile():
 #: Files that name extensions of structures or trajectories in texts for users -> what for.
 NAMED_EXTENSIONS = {
     "commands/models.py": "an example in --help",
-    "engines/gromacs/files.py": "the files of an export and a command of GROMACS",
-    "engines/lammps/files.py": "the files of an export, and commands of LAMMPS",
-    "programs/lammps.py": "the command that runs an export",
-    "engines/openmm/files.py": "the files of an export, and its script",
+    "features/external/gromacs/files.py": "the files of an export and a command of GROMACS",
+    "features/external/lammps/files.py": "the files of an export, and commands of LAMMPS",
+    "features/external/programs/lammps.py": "the command that runs an export",
+    "features/external/openmm/files.py": "the files of an export, and its script",
     "io/ase_plugin.py": "names of files that ASE cannot read, which it matches without loading the formats",
 }
 
@@ -214,7 +286,11 @@ def test_only_a_format_names_its_extensions():
         ]
         if found := [text for text in texts if isinstance(text, str) and extension.search(text)]:
             naming[name_of(path)] = found
-    strange = {name: texts for name, texts in naming.items() if not name.startswith("formats/")}
+    strange = {
+        name: texts
+        for name, texts in naming.items()
+        if not name.startswith(("formats/", "features/crystals/"))
+    }
     assert set(strange) == set(NAMED_EXTENSIONS), strange
     assert len(naming) >= len(strange) + 8  # the registry and seven modules
 
@@ -309,7 +385,7 @@ def test_a_run_of_molecules_loads_no_module_of_bodies(tmp_path):
         "import rigidmd\nscene = rigidmd.Scene.read('systems/water.toml')\nrigidmd.Simulation(scene)"
     )
     assert "rigidmd.run.molecular" in found
-    assert not {"rigidmd.run.body", "rigidmd.assemble.body"} & found
+    assert not {"rigidmd.features.bodies.run", "rigidmd.features.bodies.assemble"} & found
 
 
 def test_every_folder_of_code_is_a_package():

@@ -29,59 +29,60 @@ TESTED_BY = {
     "forces/fields/test_fields.py": "scene/fields",
     "assemble/test_species.py": "scene/species",
     "rules/test_schema.py": "commands/schema",
-    "features/analysis/test_runs.py": "analysis/files analysis/report analysis/registry"
-    " commands/analyse",
-    "features/analysis/test_conditions.py": "analysis/options",
-    "features/analysis/test_structure.py": "analysis/pair_histogram",
-    "features/analysis/test_transport.py": "analysis/relaxation",
-    "features/bodies/test_engine.py": "assemble/body assemble/body_defaults"
-    " dynamics/body_step_loop engines/body_motion engines/body_system engines/cpu/body"
-    " forces/body/applied mechanics/translation",
-    "features/bodies/test_fluid.py": "forces/body/resistance",
+    "features/analysis/test_runs.py": "features/analysis/analysis features/analysis/files features/analysis/report features/analysis/registry"
+    " features/analysis/commands/analyse",
+    "features/analysis/test_conditions.py": "features/analysis/options",
+    "features/analysis/test_structure.py": "features/analysis/pair_histogram",
+    "features/analysis/test_transport.py": "features/analysis/relaxation",
+    "features/bodies/test_engine.py": "features/bodies/assemble features/bodies/defaults"
+    " features/bodies/step_loop features/bodies/motion features/bodies/system features/bodies/cpu_engine"
+    " features/bodies/forces/applied mechanics/translation",
+    "features/bodies/test_fluid.py": "features/bodies/forces/resistance",
     "features/bodies/test_frames.py": "mechanics/time_functions",
-    "features/bodies/test_input.py": "scene/body scene/body_forces",
-    "features/bodies/test_ode.py": "mechanics/odes",
-    "features/bodies/test_rates.py": "run/body_rates run/body_summary run/body_theory run/elliptic",
-    "features/bodies/test_run.py": "run/body",
-    "features/calculators/test_ase_calculator.py": "run/atom_forces",
-    "features/crystals/test_cif.py": "formats/cif_syntax formats/crystal",
-    "features/external/test_lammps.py": "commands/export commands/verify engines/external"
-    " engines/rigid_bodies studies/other_engines",
-    "features/external/test_settings.py": "engines/force_field",
-    "features/free_energy/test_coupling.py": "analysis/free_energy forces/potentials/soft_core"
-    " studies/sweep/coupling",
-    "features/free_energy/test_insertion.py": "assemble/guest forces/neighbors/guest_pairs"
-    " forces/poses/trials",
-    "features/free_energy/test_mean_force.py": "studies/sweep/windows",
-    "features/potentials/test_custom.py": "assemble/user_code/pair_potential"
-    " assemble/user_code/pair_terms assemble/user_code/cutoffs forces/potentials/formulas",
-    "features/potentials/test_pose_tables.py": "forces/poses/pairs",
-    "features/potentials/test_python_forces.py": "assemble/user_code/force",
-    "features/potentials/test_shipped.py": "forces/poses/formulas forces/poses/gay_berne"
-    " forces/poses/multipoles forces/poses/patch forces/poses/potential",
-    "features/potentials/test_slopes.py": "forces/poses/trace",
-    "features/potentials/test_torques.py": "assemble/user_code/pose_checks",
-    "features/potentials/test_user_code.py": "assemble/user_code/binding"
-    " assemble/user_code/compiled assemble/user_code/trust core/user_modules"
-    " dynamics/user_kernels",
-    "features/studies/accuracy/test_averages.py": "studies/accuracy/averages_report",
-    "features/studies/sweep/test_sweeping.py": "commands/compare commands/sweep studies/compare"
-    " studies/sweep/folder"
-    " studies/sweep/replicas",
-    "features/studies/sweep/test_table.py": "studies/sweep/figure",
-    "features/studies/test_normal_modes.py": "commands/modes studies/gamma_point",
-    "features/view/test_animation.py": "commands/film commands/gallery commands/view"
-    " view/body_animation view/molecule_animation view/page view/solids",
-    "features/view/test_figures.py": "analysis/curve_figure figures/body figures/panels"
-    " figures/picture figures/space figures/style",
-    "features/view/test_notebook.py": "analysis/result core/display view/plots",
-    "features/view/test_run_page.py": "commands/report",
+    "features/bodies/test_input.py": "features/bodies/keys/body features/bodies/keys/forces",
+    "features/bodies/test_ode.py": "features/bodies/ode/odes",
+    "features/bodies/test_rates.py": "features/bodies/rates features/bodies/summary features/bodies/theory features/bodies/elliptic",
+    "features/bodies/test_run.py": "features/bodies/run",
+    "features/calculators/test_ase_calculator.py": "features/calculators/atom_forces",
+    "features/calculators/test_ase.py": "features/calculators/calculator",
+    "features/crystals/test_cif.py": "features/crystals/cif_syntax features/crystals/crystal",
+    "features/external/test_lammps.py": "features/external/commands/export features/external/commands/verify features/external/engines"
+    " features/external/rigid_bodies features/external/verify",
+    "features/external/test_settings.py": "features/external/force_field",
+    "features/free_energy/test_coupling.py": "features/free_energy/keys features/free_energy/estimate features/free_energy/soft_core"
+    " features/free_energy/lambda_sweep",
+    "features/free_energy/test_insertion.py": "features/free_energy/guest features/free_energy/guest_pairs"
+    " features/free_energy/pose_trials",
+    "features/free_energy/test_mean_force.py": "features/free_energy/windows",
+    "features/potentials/test_custom.py": "features/potentials/user_code/pair_potential"
+    " features/potentials/user_code/pair_terms features/potentials/user_code/cutoffs features/potentials/sites/formulas",
+    "features/potentials/test_pose_tables.py": "features/potentials/poses/pairs",
+    "features/potentials/test_python_forces.py": "features/potentials/user_code/force",
+    "features/potentials/test_shipped.py": "features/potentials/poses/bodies features/potentials/poses/formulas features/potentials/poses/gay_berne"
+    " features/potentials/poses/multipoles features/potentials/poses/patch features/potentials/poses/potential",
+    "features/potentials/test_slopes.py": "features/potentials/poses/trace",
+    "features/potentials/test_torques.py": "features/potentials/user_code/pose_checks",
+    "features/potentials/test_user_code.py": "features/potentials/user_code/binding"
+    " features/potentials/user_code/compiled features/potentials/user_code/trust core/user_modules"
+    " features/potentials/user_code/kernels",
+    "features/studies/accuracy/test_averages.py": "features/studies/accuracy/averages_report",
+    "features/studies/sweep/test_sweeping.py": "features/studies/commands/compare features/studies/commands/sweep features/studies/compare"
+    " features/studies/sweep/folder"
+    " features/studies/sweep/replicas",
+    "features/studies/sweep/test_table.py": "features/studies/sweep/figure",
+    "features/studies/test_normal_modes.py": "features/studies/commands/modes features/studies/gamma_point",
+    "features/view/test_animation.py": "features/view/commands/film features/view/commands/gallery features/view/commands/view"
+    " features/bodies/animation features/view/molecule_animation features/view/page features/view/solids",
+    "features/view/test_figures.py": "features/analysis/curve_figure features/bodies/figures features/view/figures/panels"
+    " features/view/figures/picture features/view/figures/space features/view/figures/style",
+    "features/view/test_notebook.py": "features/analysis/result core/display features/view/plots",
+    "features/view/test_run_page.py": "features/view/commands/report",
     "forces/ewald/test_direct_sum.py": "forces/ewald/smooth",
     "forces/neighbors/test_clusters.py": "forces/neighbors/tree",
     "forces/neighbors/test_pair_loop.py": "forces/neighbors/rows forces/neighbors/sites",
     "forces/potentials/test_potentials.py": "forces/potentials/lennard_jones",
     "forces/test_terms.py": "forces/neighbors/space forces/parts",
-    "formats/test_atoms.py": "formats/g96",
+    "formats/test_atoms.py": "features/crystals/g96",
     "io/test_progress.py": "io/run_files",
     "io/test_trajectory_file.py": "formats/through_mdanalysis io/structure_file",
     "run/test_checks.py": "assemble/harmonic run/failed_check run/rigid_fit run/stable_step",
@@ -92,7 +93,7 @@ TESTED_BY = {
     "run/test_simulation.py": "engines/sites engines/system run/loop run/molecular run/part",
     "run/test_summary.py": "run/report run/short_report",
     "scene/test_hints.py": "scene/base scene/stage",
-    "scene/test_validation.py": "errors",
+    "scene/test_validation.py": "errors feature",
     "scene/test_molecules.py": "commands/models formats/bonds io/scene_file",
     "support/test_tiers.py": "core/bound_process",
 }
@@ -105,7 +106,6 @@ FEATURES = {
     "features/bodies/test_input.py": "errors in scenes of bodies",
     "features/calculators/test_ase_calculator.py": "rigidmd as a calculator of ASE",
     "features/calculators/test_ase_trajectory.py": "trajectories of ASE",
-    "features/calculators/test_calculators.py": "calculators of ASE as forces",
     "features/crystals/test_framework.py": "frozen frameworks",
     "features/external/test_names.py": "names of users in generated files",
     "features/potentials/test_custom_thermostats.py": "thermostats of users",
@@ -144,6 +144,8 @@ def has_file_of_its_name(module: str) -> bool:
     """Whether a test file has the name of a module, or of the package in a package that it is
     in. The file is in the folder of the package or among the features."""
     package, *inner = module.split("/")
+    if package == "features":
+        package, *inner = f"features/{inner[0]}", *inner[1:]
     return any(
         name in (inner or [package]) and file.startswith((f"{package}/", "features/"))
         for file, name in names_of_files().items()

@@ -8,10 +8,10 @@ from support.common import small_scene
 from support.stops import same_after_stops
 
 from rigidmd.errors import SceneError
+from rigidmd.features.studies.accuracy.averages import start_of_last_stage
 from rigidmd.run import Simulation
 from rigidmd.run.report import summary_text
 from rigidmd.scene import Scene
-from rigidmd.studies.accuracy.averages import start_of_last_stage
 
 FS = 1e-3  # ps
 LIQUID = {"timestep_fs": 2.0, "temperature_K": 300.0}

@@ -15,7 +15,9 @@ from rigidmd.assemble.describe import describe
 from rigidmd.core.state import state_of
 from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.errors import RigidMDWarning, SceneError, SimulationError
-from rigidmd.figures.panels import panels
+from rigidmd.features.studies.accuracy.accuracy import measure_accuracy
+from rigidmd.features.view.figures.panels import panels
+from rigidmd.features.view.run_page import write_report
 from rigidmd.io.trajectory import read_frames
 from rigidmd.run import Every, Simulation
 from rigidmd.run import minimise as minimise_module
@@ -24,9 +26,7 @@ from rigidmd.run.minimise import minimise, precision_of_minimisation
 from rigidmd.run.record import read_record
 from rigidmd.run.schedule import CheckpointSchedule
 from rigidmd.scene import Scene
-from rigidmd.studies.accuracy.accuracy import measure_accuracy
 from rigidmd.units import KJ_PER_MOL
-from rigidmd.view.run_page import write_report
 
 
 def test_it_begins_from_overlaps():

@@ -9,8 +9,8 @@ from support.common import ROOT, same_bits, small_scene
 
 import rigidmd
 from rigidmd.errors import OutputError, RigidMDWarning
-from rigidmd.figures import style
-from rigidmd.figures.body import FIGURES
+from rigidmd.features.bodies.figures import FIGURES
+from rigidmd.features.view.figures import style
 from rigidmd.run import Every, Observer, Simulation
 from rigidmd.scene import Scene
 

@@ -13,6 +13,7 @@ from rigidmd.commands.cli import main
 from rigidmd.core.integrators import DRIFT, KICK, SCHEMES
 from rigidmd.engines.protocol import NotFiniteError
 from rigidmd.errors import SceneError, SimulationError
+from rigidmd.features.studies.accuracy.averages import measure_averages, start_of_last_stage
 from rigidmd.run import Simulation, trials
 from rigidmd.run.pilot import choice
 from rigidmd.run.pilot.choice import choose
@@ -21,7 +22,6 @@ from rigidmd.run.pilot.sampling import bias_of_potential, mean_square_rate
 from rigidmd.run.pilot.stages import _fit_step, choose_for_stage
 from rigidmd.run.trials import Method, TrialSystem
 from rigidmd.scene import Scene
-from rigidmd.studies.accuracy.averages import measure_averages, start_of_last_stage
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"
 

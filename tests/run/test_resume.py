@@ -32,11 +32,11 @@ from support.stops import (
 
 from rigidmd.commands import cli
 from rigidmd.errors import CheckpointError
+from rigidmd.features.bodies.run import BodyRecord, BodyRun
 from rigidmd.io.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from rigidmd.io.folder import CHECKPOINT, PREVIOUS
 from rigidmd.run import Every, Simulation, run_together
 from rigidmd.run import resume as provenance
-from rigidmd.run.body import BodyRecord, BodyRun
 from rigidmd.run.molecular import MolecularRecord, MolecularRun
 from rigidmd.run.resume import Arrays
 from rigidmd.scene import Scene

@@ -7,12 +7,12 @@ import pytest
 
 from rigidmd.assemble.build import build
 from rigidmd.commands.cli import main
+from rigidmd.features.view.molecule_figure import models_table
 from rigidmd.io.scene_file import write_scene
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 from rigidmd.scene.models import MODELS, available_models, load_model, read_molecule
 from rigidmd.units import KJ_PER_MOL
-from rigidmd.view.molecule_figure import models_table
 
 TABLE = """
 title = "aromatic"

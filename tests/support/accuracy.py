@@ -1,9 +1,9 @@
 """Trials whose numbers are made up."""
 
+from rigidmd.features.studies.accuracy.measurement import IntegratorAccuracy
 from rigidmd.run.trial_systems import body_trial_system
 from rigidmd.run.trials import Trial
 from rigidmd.scene import Scene
-from rigidmd.studies.accuracy.measurement import IntegratorAccuracy
 from support.common import ROOT
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"

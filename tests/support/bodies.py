@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.integrate import quad, solve_ivp
 
-from rigidmd.assemble.body import build_body
+from rigidmd.features.bodies.assemble import build_body
 from rigidmd.mechanics.rotation import from_vector, hat
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from rigidmd import Scene, Simulation
-from rigidmd.forces.poses.gay_berne import GayBerne
+from rigidmd.features.potentials.poses.gay_berne import GayBerne
 from support.common import site
 
 ROD = {"length_A": 12.0, "width_A": 4.0, "epsilon_kJ_mol": 1.0, "side": 1.0, "end": 0.2}

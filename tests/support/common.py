@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd import BodyScene, Scene
-from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.assemble.build import build
 from rigidmd.commands.cli import main
 from rigidmd.compile import kernel
@@ -18,6 +17,7 @@ from rigidmd.core.state import NO_CELL, NOW, State
 from rigidmd.engines import observables
 from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.engines.system import System
+from rigidmd.features.analysis.rigid_frames import RigidFrames
 from rigidmd.mechanics.free_rotor import rotate
 from rigidmd.mechanics.rotation import random_rotations
 

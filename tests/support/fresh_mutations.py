@@ -7,7 +7,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F1",
         "g(r): the mean volume of the run, not that of each frame",
-        "analysis/built_in/structure.py",
+        "features/analysis/built_in/structure.py",
         "        g[k] = counts * float(frames.volume[k]) / (",
         "        g[k] = counts * float(frames.volume.mean()) / (",
         (
@@ -17,7 +17,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F2",
         "structure factor: the transpose of the reciprocal cell",
-        "analysis/built_in/structure.py",
+        "features/analysis/built_in/structure.py",
         "    reciprocal = 2 * np.pi * np.linalg.inv(thinned.mean_cell).T\n",
         "    reciprocal = 2 * np.pi * np.linalg.inv(thinned.mean_cell)\n",
         ("features/analysis/test_mixtures.py::test_a_structure_factor_is_the_sum_over_its_sites",),
@@ -25,7 +25,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F3",
         "structure factor: sites of one name are divided by the number of molecules",
-        "analysis/built_in/structure.py",
+        "features/analysis/built_in/structure.py",
         "np.bincount(members, size) / np.bincount(members) / len(at)",
         "np.bincount(members, size) / np.bincount(members) / thinned.positions.shape[1]",
         ("features/analysis/test_mixtures.py::test_a_structure_factor_is_the_sum_over_its_sites",),
@@ -33,7 +33,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F4",
         "hydrogen bonds: the vector between two sites has one sign for both of its ends",
-        "analysis/built_in/structure.py",
+        "features/analysis/built_in/structure.py",
         "    way = np.concatenate([gaps, -gaps])",
         "    way = np.concatenate([gaps, gaps])",
         (
@@ -43,7 +43,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F5",
         "profile of the density: its axis has the component of the edge for the height of the cell",
-        "analysis/built_in/structure.py",
+        "features/analysis/built_in/structure.py",
         "np.mean([heights(cell)[k] for cell in run.cell])",
         "np.mean([cell[k, k] for cell in run.cell])",
         (
@@ -53,7 +53,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F6",
         "paths without what a barostat scaled: the cell is transposed",
-        "analysis/rigid_frames.py",
+        "features/analysis/rigid_frames.py",
         '        inside = np.einsum("fni,fij->fnj", self.positions, np.linalg.inv(self.cell))',
         '        inside = np.einsum("fni,fji->fnj", self.positions, np.linalg.inv(self.cell))',
         ("features/analysis/test_rigid_frames.py::test_scaling_the_box_moves_nothing",),
@@ -61,7 +61,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F7",
         "wrapped frames of a cell that changes are unwrapped with the first cell",
-        "analysis/rigid_frames.py",
+        "features/analysis/rigid_frames.py",
         '        inside = np.einsum("fni,fij->fnj", position, np.linalg.inv(cells))',
         '        inside = np.einsum("fni,ij->fnj", position, np.linalg.inv(cells[0]))',
         (
@@ -79,7 +79,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F9",
         "error of a dielectric constant in a reaction field: the slope without its square",
-        "analysis/built_in/rotation.py",
+        "features/analysis/built_in/rotation.py",
         "(largest / left) ** 2",
         "(largest / left)",
         (
@@ -89,7 +89,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F10",
         "viscosity: rectangles at the ends of steps, not trapezoids",
-        "analysis/built_in/transport.py",
+        "features/analysis/built_in/transport.py",
         "0.5 * (correlations + correlations[:, :1])",
         "correlations[:, :1]",
         (
@@ -109,7 +109,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F12",
         "bias of a mean against the step: its error forgets that the limit is made of the same mean",
-        "studies/extrapolation.py",
+        "features/studies/extrapolation.py",
         "        return point.mean - self.limit, sqrt(max(0.0, others) + ((1 - weight) * point.error) ** 2)",
         "        return point.mean - self.limit, sqrt(max(0.0, others) + point.error**2)",
         (
@@ -145,7 +145,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F16",
         "energy of a body in a fluid: its impulse along the lab's axes meets masses along its own",
-        "engines/body_motion.py",
+        "features/bodies/motion.py",
         'along = np.einsum("tji,tj->ti", rotation, impulse)',
         'along = np.einsum("tij,tj->ti", rotation, impulse)',
         ("features/bodies/test_fluid.py::test_a_frictionless_fluid_keeps_energy_and_impulse",),
@@ -153,7 +153,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F17",
         "momentum of wheels in the output: along principal axes, not those of the scene",
-        "engines/body_motion.py",
+        "features/bodies/motion.py",
         "system.moments(times)[1] @ system.axes.T)",
         "system.moments(times)[1])",
         (
@@ -221,15 +221,15 @@ FRESH: list[Mutation] = [
     Mutation(
         "F25",
         "GSD: the tilt yz over the edge b",
-        "formats/gsd.py",
+        "features/crystals/gsd.py",
         "bx / ly, cx / lz, cy / lz]",
         "bx / ly, cx / lz, cy / ly]",
-        ("formats/test_gsd.py::test_frames_come_back",),
+        ("features/crystals/test_gsd.py::test_frames_come_back",),
     ),
     Mutation(
         "F26",
         "LAMMPS: the pressure of the tail correction is added to that asked for",
-        "engines/lammps/files.py",
+        "features/external/lammps/files.py",
         "[(bar * BAR - tail_pressure) / ATMOSPHERE for bar",
         "[(bar * BAR + tail_pressure) / ATMOSPHERE for bar",
         (
@@ -239,7 +239,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F27",
         "LAMMPS: the period of a chain for the inverse of its angular frequency",
-        "engines/lammps/files.py",
+        "features/external/lammps/files.py",
         "_num(1e3 * stage.thermostat_time / (2 * pi))",
         "_num(1e3 * stage.thermostat_time)",
         ("features/external/test_settings.py::test_lammps_has_the_period_of_chains",),
@@ -247,7 +247,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F28",
         "GROMACS: the pressure along z of a semi-isotropic box is that along y",
-        "engines/gromacs/files.py",
+        "features/external/gromacs/files.py",
         "for value in (pressure[0], pressure[2])[:count]",
         "for value in (pressure[0], pressure[1])[:count]",
         ("features/external/test_settings.py::test_gromacs_has_the_pressure_of_each_direction",),
@@ -255,7 +255,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F29",
         "GROMACS: a virtual site off its plane, 1/Å for 1/nm",
-        "engines/gromacs/files.py",
+        "features/external/gromacs/files.py",
         "{site.cross / NM:.12g}",
         "{site.cross:.12g}",
         (
@@ -265,7 +265,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F30",
         "OpenMM: the tail correction of one molecule in nm³ has one power of the volume too many",
-        "engines/openmm/system.py",
+        "features/external/openmm/system.py",
         "float(tail.energy_volume) / KJ_PER_MOL * NM**3",
         "float(tail.energy_volume) / KJ_PER_MOL * NM**6",
         (
@@ -275,7 +275,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F31",
         "torques from forces on sites: arms from the mean of the sites, not the centre of mass",
-        "engines/rigid_bodies.py",
+        "features/external/rigid_bodies.py",
         "        arm = position - self._mean(position)[self._molecule]\n        if",
         "        count = np.bincount(self._molecule)[:, None]\n        arm = position - (self._sum(position) / count)[self._molecule]\n        if",
         (
@@ -286,7 +286,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F32",
         "table of a sweep: the error of the energy of a molecule goes by the root of their number",
-        "studies/sweep/table.py",
+        "features/studies/sweep/table.py",
         "None if error is None else error / n",
         "None if error is None else error / n**0.5",
         (
@@ -296,7 +296,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F33",
         "averages against the step: what comes before equilibrium counts",
-        "studies/accuracy/averages.py",
+        "features/studies/accuracy/averages.py",
         '    late = results["time"] > EQUILIBRATION * sample',
         '    late = results["time"] > 0',
         (
@@ -330,7 +330,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F37",
         "a force applied to a pinned body: its arm along the body's axes, itself along the lab's",
-        "engines/body_system.py",
+        "features/bodies/system.py",
         "np.cross(self.centre, self.pose(time, state).rotation.T @ force)",
         "np.cross(self.centre, force)",
         ("features/bodies/test_engine.py::test_a_python_function_can_apply_what_a_scene_does",),
@@ -338,7 +338,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F38",
         "torque that turns with a body: along the scene's axes, not the principal ones",
-        "assemble/body.py",
+        "features/bodies/assemble.py",
         "            force, torque = _rotated(force, axes.T), _rotated(torque, axes.T)",
         "            force, torque = _rotated(force, axes.T), torque",
         (
@@ -380,7 +380,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F43",
         "second virial coefficient: the error of dB2/dT is that of T dB2/dT",
-        "studies/virial.py",
+        "features/free_energy/virial.py",
         "values[1] / t, errors[1] / t, samples",
         "values[1] / t, errors[1], samples",
         ("features/free_energy/test_virial.py::test_the_derivative_and_its_error",),
@@ -388,7 +388,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F44",
         "insertion: the error of the heat of adsorption forgets that it is a ratio of two means",
-        "analysis/built_in/insertion.py",
+        "features/free_energy/insertion.py",
         "        heat = [(u - w * energy / weight) / weight for _, w, u in moments]",
         "        heat = [u / weight for _, w, u in moments]",
         (
@@ -398,7 +398,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F45",
         "insertion: the fugacity of a species in a mixture is by the number of all molecules",
-        "analysis/built_in/insertion.py",
+        "features/free_energy/insertion.py",
         '            (f"fugacity of {name}", same.sum())',
         '            (f"fugacity of {name}", len(same))',
         ("features/free_energy/test_insertion.py::test_ideal_gas",),
@@ -406,7 +406,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F46",
         "free energy of coupling: the density of its standard state is that of a volume in nm³ for Å³",
-        "studies/sweep/coupling.py",
+        "features/free_energy/lambda_sweep.py",
         "_standard_state(system, 1e3 * float(np.mean(volumes)))",
         "_standard_state(system, float(np.mean(volumes)))",
         ("features/free_energy/test_coupling.py::test_a_sweep_has_a_free_energy",),
@@ -414,7 +414,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F47",
         "soft core: the tail correction counts unlike kinds once",
-        "forces/potentials/soft_core.py",
+        "features/free_energy/soft_core.py",
         "        pairs = count[i] * count[j] * (1.0 if i == j else 2.0)",
         "        pairs = count[i] * count[j] * 1.0",
         (
@@ -424,7 +424,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F48",
         "potentials of two bodies: half of the harmonic mean",
-        "forces/poses/shipped.py",
+        "features/potentials/poses/shipped.py",
         '    "harmonic": lambda x, y: 2 * x * y / (x + y),',
         '    "harmonic": lambda x, y: x * y / (x + y),',
         ("features/potentials/test_body_pairs.py::test_a_text_has_the_energy_of_all_its_pairs",),
@@ -432,7 +432,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F49",
         "list of pairs of bodies: the strain xz of a cell that leans forgets its part by xy",
-        "forces/poses/pair_list.py",
+        "features/potentials/poses/pair_list.py",
         "        xz = (cell[2, 0] - built[2, 0] * xx - built[2, 1] * xy) / built[2, 2]",
         "        xz = (cell[2, 0] - built[2, 0] * xx) / built[2, 2]",
         (
@@ -442,7 +442,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F50",
         "joint fit with a barostat that reads no momenta: the pressure with F²/12m for F²/36m",
-        "studies/joint_fit.py",
+        "features/studies/joint_fit.py",
         "    return float((moving + mean.of_forces / 36) / mean.volume)",
         "    return float((moving + mean.of_forces / 12) / mean.volume)",
         ("features/studies/test_joint_fit.py::test_slopes_and_their_errors_are_those_of_springs",),
@@ -450,7 +450,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F51",
         "joint fit: errors of slopes by the jackknife with 1/√(B - 1) for √((B - 1)/B)",
-        "studies/joint_fit.py",
+        "features/studies/joint_fit.py",
         "    changes = (table - table.mean(axis=0)) * sqrt((BLOCKS - 1) / BLOCKS)",
         "    changes = (table - table.mean(axis=0)) / sqrt(BLOCKS - 1)",
         ("features/studies/test_joint_fit.py::test_slopes_and_their_errors_are_those_of_springs",),
@@ -458,7 +458,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F52",
         "potential of mean force: windows count alike, whatever their numbers of samples",
-        "analysis/mean_force.py",
+        "features/free_energy/mean_force.py",
         "    weight = -np.asarray(logsumexp(np.log(count)[:, None] + free[:, None] - bias, axis=0))",
         "    weight = -np.asarray(logsumexp(free[:, None] - bias, axis=0))",
         ("features/free_energy/test_mean_force.py::test_a_known_potential",),
@@ -466,7 +466,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F53",
         "potential of mean force: the overlap matrix is transposed",
-        "analysis/mean_force.py",
+        "features/free_energy/mean_force.py",
         "    return free, part @ part.T / count",
         "    return free, part @ part.T / count[:, None]",
         (
@@ -494,7 +494,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F56",
         "surface tension: the height of the box along z for any normal",
-        "analysis/built_in/interfaces.py",
+        "features/analysis/built_in/interfaces.py",
         "    return time, 0.5 * slab.height * 1.5 * (normal",
         "    return time, 0.5 * frames.cell[0, 2, 2] * 1.5 * (normal",
         (
@@ -504,7 +504,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F57",
         "diffusion: the change of the slope, by which a short run is refused, is three times too large",
-        "analysis/built_in/transport.py",
+        "features/analysis/built_in/transport.py",
         "        return np.array([slope, second_half - first_half]) / 6",
         "        return np.array([slope / 6, (second_half - first_half) / 2])",
         ("features/analysis/test_transport.py::test_diffusion_needs_a_straight_displacement",),
@@ -512,7 +512,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F58",
         "table of a sweep of bodies: lowest and highest values are exchanged",
-        "studies/sweep/table.py",
+        "features/studies/sweep/table.py",
         "        numbers = values.mean(), values.min(), values.max(), values[-1]",
         "        numbers = values.mean(), values.max(), values.min(), values[-1]",
         ("features/studies/sweep/test_table.py::test_bodies_and_words",),
@@ -528,7 +528,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F60",
         "animation: molecules are put into the box by the transposed cell",
-        "view/molecule_animation.py",
+        "features/view/molecule_animation.py",
         "    columns = np.swapaxes(frames.cells, 1, 2)",
         "    columns = frames.cells",
         ("features/view/test_run_page.py::test_molecules_are_put_into_a_triclinic_cell",),
@@ -536,7 +536,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F61",
         "second virial coefficient: a requested error in cm³/mol is taken as a relative one",
-        "studies/virial.py",
+        "features/free_energy/virial.py",
         "requested = error or RELATIVE_ERROR * np.abs(values).max(axis=0)",
         "requested = (error or RELATIVE_ERROR) * np.abs(values).max(axis=0)",
         ("features/free_energy/test_virial.py::test_published_values",),
@@ -544,7 +544,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F62",
         "responses at constant volume: the sign of the configurational part of gamma_V",
-        "analysis/built_in/thermodynamics.py",
+        "features/analysis/built_in/thermodynamics.py",
         "matter.count * BOLTZMANN / matter.volume + of.xy / matter.temperature",
         "matter.count * BOLTZMANN / matter.volume - of.xy / matter.temperature",
         (
@@ -554,7 +554,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F63",
         "limits at a step of 0: the scatter of runs that are analysed together without n - 1",
-        "studies/extrapolation.py",
+        "features/studies/extrapolation.py",
         "count * (count - 1) * together.error**2",
         "count * together.error**2",
         (
@@ -564,7 +564,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F64",
         "interfaces: cosines of dipoles with the axis, not with the outward normal",
-        "analysis/built_in/interfaces.py",
+        "features/analysis/built_in/interfaces.py",
         "weights=cosine * np.sign(at))[0]",
         "weights=cosine)[0]",
         (
@@ -600,7 +600,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F68",
         "diffusion: the coefficient in an infinite box forgets the error of the viscosity",
-        "analysis/built_in/transport.py",
+        "features/analysis/built_in/transport.py",
         "float(np.hypot(value.error, doubt))",
         "float(value.error)",
         (
@@ -610,7 +610,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F69",
         "diffusion: the correction for cubic boxes in one that is cubic but for its angles",
-        "analysis/built_in/transport.py",
+        "features/analysis/built_in/transport.py",
         "np.abs(cell - cell[0, 0] * np.eye(3)).max()",
         "np.abs(np.diag(cell) - cell[0, 0]).max()",
         (
@@ -620,7 +620,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F70",
         "viscosity: errors of the running integral as if the five components were one",
-        "analysis/built_in/transport.py",
+        "features/analysis/built_in/transport.py",
         "running.std(axis=0, ddof=1) / np.sqrt(len(running))",
         "running.std(axis=0, ddof=1) / np.sqrt(len(parts))",
         (
@@ -630,7 +630,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F71",
         "dielectric constant: half of what the subtraction of the mean dipole hides",
-        "analysis/built_in/rotation.py",
+        "features/analysis/built_in/rotation.py",
         "min(0.5, 2 * correlation / runs.span)",
         "min(0.5, correlation / runs.span)",
         (
@@ -640,7 +640,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F72",
         "several runs: means over runs of different lengths count alike",
-        "analysis/runs.py",
+        "features/analysis/runs.py",
         "return np.average(np.asarray(values, float), axis=0, weights=self.weights)",
         "return np.average(np.asarray(values, float), axis=0)",
         ("features/analysis/test_built_in.py::test_analyses_of_several_runs_are_over_their_sum",),
@@ -648,7 +648,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F73",
         "responses: the error of a heat capacity per gram is the one per mole",
-        "analysis/built_in/thermodynamics.py",
+        "features/analysis/built_in/thermodynamics.py",
         "error=per_gram * value.error",
         "error=value.error",
         (
@@ -658,7 +658,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F74",
         "responses: what means hide is that of one run, however many there are",
-        "analysis/built_in/thermodynamics.py",
+        "features/analysis/built_in/thermodynamics.py",
         "self.hidden /= len(pairs)",
         "self.hidden /= 1",
         ("features/analysis/test_thermodynamics.py::test_a_mean_that_is_subtracted_hides_nothing",),
@@ -666,7 +666,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F75",
         "slab: the error of its thickness is that of half of it",
-        "analysis/built_in/interfaces.py",
+        "features/analysis/built_in/interfaces.py",
         "else factor * float(errors[k] or 0.0)",
         "else float(errors[k] or 0.0)",
         ("features/analysis/test_interfaces.py::test_errors_of_species_in_a_slab_are_honest",),
@@ -674,7 +674,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F76",
         "insertion: frames count alike, whatever their volumes",
-        "analysis/built_in/insertion.py",
+        "features/free_energy/insertion.py",
         "return self.volume * np.array([np.ones",
         "return self.volume.mean() * np.array([np.ones",
         ("features/free_energy/test_insertion.py::test_frames_count_by_their_volumes",),
@@ -682,7 +682,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F77",
         "free energy: the overlap matrix is transposed",
-        "analysis/free_energy.py",
+        "features/free_energy/estimate.py",
         "overlap[:, k] for k, x",
         "overlap[k] for k, x",
         (
@@ -692,7 +692,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F78",
         "free energy: the least overlap is that of the second lambda with the first",
-        "analysis/free_energy.py",
+        "features/free_energy/estimate.py",
         "least = float(np.diag(overlap, 1).min())",
         "least = float(np.diag(overlap, -1).min())",
         (
@@ -702,7 +702,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F79",
         "joint fit: fluctuations of the energy of all molecules are those of the mobile ones",
-        "studies/joint_fit.py",
+        "features/studies/joint_fit.py",
         "of_enthalpy = at.count * with_enthalpy.potential",
         "of_enthalpy = at.moving * with_enthalpy.potential",
         ("features/studies/test_joint_fit.py::test_slopes_and_their_errors_are_those_of_springs",),
@@ -710,7 +710,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F80",
         "joint fit: heat capacities per molecule count frozen ones",
-        "studies/joint_fit.py",
+        "features/studies/joint_fit.py",
         "of_enthalpy / thermal / at.temperature) / at.moving",
         "of_enthalpy / thermal / at.temperature) / at.count",
         ("features/studies/test_joint_fit.py::test_slopes_and_their_errors_are_those_of_springs",),
@@ -718,7 +718,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F81",
         "joint fit: a large chi² scales errors without its root",
-        "studies/joint_fit.py",
+        "features/studies/joint_fit.py",
         "factor = sqrt(last[0].chi2 / last[0].freedom)",
         "factor = last[0].chi2 / last[0].freedom",
         (
@@ -728,7 +728,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F82",
         "joint fit: errors of responses go with the number of samples, not its root",
-        "studies/joint_fit.py",
+        "features/studies/joint_fit.py",
         "else common / sqrt(of.samples)",
         "else common / of.samples",
         (
@@ -738,7 +738,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F83",
         "averages against the step: the error of a bias is not in the unit of the bias",
-        "studies/accuracy/averages.py",
+        "features/studies/accuracy/averages.py",
         "return value / quantity.bias_size, error / quantity.bias_size",
         "return value / quantity.bias_size, error",
         (
@@ -766,15 +766,15 @@ FRESH: list[Mutation] = [
     Mutation(
         "F86",
         "GSD: velocities of sites from angular velocities along the axes of the body",
-        "formats/gsd.py",
+        "features/crystals/gsd.py",
         'lab = np.einsum("sij,sj->si", from_quaternion(self.orientation[body]), omega)',
         "lab = omega",
-        ("formats/test_gsd.py::test_frames_come_back",),
+        ("features/crystals/test_gsd.py::test_frames_come_back",),
     ),
     Mutation(
         "F87",
         "spectrum: the error of a peak is the resolution, not half of it",
-        "analysis/built_in/rotation.py",
+        "features/analysis/built_in/rotation.py",
         "float(wavenumbers[1] / 2)",
         "float(wavenumbers[1])",
         (
@@ -784,7 +784,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F88",
         "orientation: the error of tau2 is that of tau1",
-        "analysis/built_in/rotation.py",
+        "features/analysis/built_in/rotation.py",
         "float(values[l, -1]), float(errors[l, -1])",
         "float(values[l, -1]), float(errors[0, -1])",
         ("features/analysis/test_rotation.py::test_free_rotational_diffusion_decays_as_it_must",),
@@ -792,7 +792,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F89",
         "dielectric constant so far: sums over all frames, not over those so far",
-        "analysis/built_in/rotation.py",
+        "features/analysis/built_in/rotation.py",
         "running = np.mean([np.cumsum(of_run[: runs.shortest]) / count",
         "running = np.mean([np.cumsum(of_run[: runs.shortest]) / count[-1]",
         (
@@ -802,7 +802,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F90",
         "dielectric constant: mean total dipoles in e Å under the unit D",
-        "analysis/built_in/rotation.py",
+        "features/analysis/built_in/rotation.py",
         "[M[:, k] / DEBYE for M in dipoles]",
         "[M[:, k] for M in dipoles]",
         (
@@ -812,7 +812,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F91",
         "free energy: the error of a part is that from the first lambda",
-        "analysis/free_energy.py",
+        "features/free_energy/estimate.py",
         "float(errors[i, j])",
         "float(errors[0, j])",
         (
@@ -822,7 +822,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F92",
         "insertion: errors of a profile are the scatter of its blocks, not of their mean",
-        "analysis/built_in/insertion.py",
+        "features/free_energy/insertion.py",
         "errors = error_of_mean(parts) if parts",
         "errors = np.std(parts, axis=0, ddof=1) if parts",
         (
@@ -832,7 +832,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F93",
         "joint fit: the error of a bias grows with the step, not with its square",
-        "studies/sweep/limits.py",
+        "features/studies/sweep/limits.py",
         "return slope * step**2, error * step**2",
         "return slope * step**2, error * step",
         (
@@ -842,7 +842,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F94",
         "LAMMPS: wells of unlike ellipsoids by the arithmetic mean",
-        "engines/lammps/files.py",
+        "features/external/lammps/files.py",
         'sqrt(p["epsilon_kJ_mol"] * q["epsilon_kJ_mol"])',
         '(p["epsilon_kJ_mol"] + q["epsilon_kJ_mol"]) / 2',
         (

@@ -289,7 +289,7 @@ TIERS = {
         "dynamics/test_step_loop.py": (
             "no_drift_beyond_its_error_at_one_femtosecond_over_twenty_picoseconds",
         ),
-        "features/monte_carlo/test_hybrid_monte_carlo.py": (
+        "features/monte_carlo/test_trajectories.py": (
             "the_weights_of_every_integrator_have_the_mean_one[takahashi_imada]",
         ),
         "io/test_trajectory.py": ("frames_of_xtc_are_those_that_mdanalysis_writes[None]",),

@@ -59,7 +59,7 @@ CORE = [
     Mutation(
         "A5",
         "textbook solvers: the sign of the Coriolis term of the velocity",
-        "engines/ode/rates.py",
+        "features/bodies/ode/rates.py",
         "- W[i] * V[j] + W[j] * V[i]",
         "+ W[i] * V[j] - W[j] * V[i]",
         (
@@ -69,7 +69,7 @@ CORE = [
     Mutation(
         "A6",
         "textbook solvers: the growth of the moments of inertia is left out",
-        "engines/ode/rates.py",
+        "features/bodies/ode/rates.py",
         "L[i] * y[n + j] - L[j] * y[n + i] - motor - growth * y[n + k]",
         "L[i] * y[n + j] - L[j] * y[n + i] - motor",
         (
@@ -89,7 +89,7 @@ CORE = [
     Mutation(
         "A8",
         "mean squared displacement: one origin too few",
-        "analysis/built_in/transport.py",
+        "features/analysis/built_in/transport.py",
         "/ (frames - lag) / n",
         "/ (frames - lag - 1) / n",
         ("features/analysis/test_built_in.py::test_correlations_are_those_of_the_definition",),
@@ -97,7 +97,7 @@ CORE = [
     Mutation(
         "A9",
         "viscosity: the differences of normal stresses are not halved",
-        "analysis/built_in/transport.py",
+        "features/analysis/built_in/transport.py",
         "(xx - yy) / 2, (yy - zz) / 2], axis=1)",
         "(xx - yy), (yy - zz)], axis=1)",
         (
@@ -107,7 +107,7 @@ CORE = [
     Mutation(
         "A10",
         "LAMMPS data file: xz and yz of the box exchanged",
-        "engines/lammps/files.py",
+        "features/external/lammps/files.py",
         "        tilt = (state.cell[1, 0], state.cell[2, 0], state.cell[2, 1])",
         "        tilt = (state.cell[1, 0], state.cell[2, 1], state.cell[2, 0])",
         ("features/external/test_lammps.py::test_both_engines_compute_the_same[triclinic]",),
@@ -125,7 +125,7 @@ CORE = [
     Mutation(
         "A12",
         "dielectric constant: <M>², which is 0, is taken off",
-        "analysis/built_in/rotation.py",
+        "features/analysis/built_in/rotation.py",
         "    centre = np.zeros(3)",
         "    centre = runs.mean([M.mean(axis=0) for M in dipoles])",
         (
@@ -195,7 +195,7 @@ RINGS = [
     Mutation(
         "B7",
         "spectra: 33.36 for 29.98 in the wave number",
-        "analysis/built_in/rotation.py",
+        "features/analysis/built_in/rotation.py",
         "PER_CM = 0.0299792458",
         "PER_CM = 0.0333564095",
         ("features/analysis/test_mixtures.py::test_wave_numbers_and_freedoms_of_a_mixture",),
@@ -203,7 +203,7 @@ RINGS = [
     Mutation(
         "B8",
         "rotational diffusion: rotations about axes of the lab, not of the body",
-        "analysis/built_in/rotation.py",
+        "features/analysis/built_in/rotation.py",
         'between = np.einsum("fnji,fnjk->fnik", Q[:-1], Q[1:])',
         'between = np.einsum("fnij,fnkj->fnik", Q[1:], Q[:-1])',
         (
@@ -213,7 +213,7 @@ RINGS = [
     Mutation(
         "B9",
         "n(r) of a mixture: divided by the number of the other species",
-        "analysis/built_in/structure.py",
+        "features/analysis/built_in/structure.py",
         "len(thinned.first.sites(a, slice(0, 1))[1])",
         "len(thinned.first.sites(b, slice(0, 1))[1])",
         (
@@ -223,7 +223,7 @@ RINGS = [
     Mutation(
         "B10",
         "spectrum of linear molecules: twice as high",
-        "analysis/built_in/rotation.py",
+        "features/analysis/built_in/rotation.py",
         "moments[2], lambda part, group: _lab_momenta",
         "2 * moments[2], lambda part, group: _lab_momenta",
         ("features/analysis/test_mixtures.py::test_wave_numbers_and_freedoms_of_a_mixture",),
@@ -277,7 +277,7 @@ RINGS = [
     Mutation(
         "B16",
         "LAMMPS: pressures in bar where it reads atm",
-        "engines/lammps/files.py",
+        "features/external/lammps/files.py",
         "ATMOSPHERE = 1.01325 * BAR",
         "ATMOSPHERE = 1.0 * BAR",
         (
@@ -287,7 +287,7 @@ RINGS = [
     Mutation(
         "B17",
         "LAMMPS: the damping time of Langevin is the friction",
-        "engines/lammps/files.py",
+        "features/external/lammps/files.py",
         "{_num(1e3 / stage.frictions[0])}",
         "{_num(1e3 * stage.frictions[0])}",
         ("features/external/test_settings.py::test_lammps_has_the_damping_time_of_langevin",),
@@ -295,7 +295,7 @@ RINGS = [
     Mutation(
         "B18",
         "GROMACS: tau-t ten times as long",
-        "engines/gromacs/files.py",
+        "features/external/gromacs/files.py",
         '"tau-t": f"{stage.thermostat_time:.12g}"',
         '"tau-t": f"{10 * stage.thermostat_time:.12g}"',
         ("features/external/test_settings.py::test_gromacs_has_the_time_of_each_thermostat",),
@@ -303,7 +303,7 @@ RINGS = [
     Mutation(
         "B19",
         "OpenMM: the inverse of the friction of Langevin",
-        "engines/openmm/system.py",
+        "features/external/openmm/system.py",
         "mm.LangevinMiddleIntegrator(stage.temperatures[0], stage.frictions[0], dt)",
         "mm.LangevinMiddleIntegrator(stage.temperatures[0], 1 / stage.frictions[0], dt)",
         ("features/external/test_settings.py::test_openmm_has_the_friction_of_langevin",),
@@ -330,7 +330,7 @@ RINGS = [
     Mutation(
         "B22",
         "profile of the density: sites are not rotated with their molecule",
-        "analysis/built_in/structure.py",
+        "features/analysis/built_in/structure.py",
         "                at = at + part.Q[:, kind.index] @ kind.molecule.positions_body[site]",
         "                at = at + kind.molecule.positions_body[site]",
         (
@@ -340,7 +340,7 @@ RINGS = [
     Mutation(
         "B23",
         "hydrogen bonds: O-H is not rotated with its molecule",
-        "analysis/built_in/structure.py",
+        "features/analysis/built_in/structure.py",
         "arm[k] = rotation @ (body[hydrogen] - body[site])",
         "arm[k] = body[hydrogen] - body[site]",
         (
@@ -368,7 +368,7 @@ RINGS = [
     Mutation(
         "R-hmc-1",
         "hybrid Monte Carlo: the sign of the change of the energy in the test",
-        "dynamics/hybrid_monte_carlo.py",
+        "features/monte_carlo/trajectories.py",
         "    if log(u) < -loss:",
         "    if log(u) < loss:",
         (
@@ -378,11 +378,11 @@ RINGS = [
     Mutation(
         "R-hmc-2",
         "hybrid Monte Carlo: a barostat takes the virial of a trajectory that was rejected",
-        "dynamics/hybrid_monte_carlo.py",
+        "features/monte_carlo/trajectories.py",
         "        registers.known[0] = 0",
         "        registers.known[0] = 1",
         (
-            "features/monte_carlo/test_hybrid_monte_carlo.py::test_energy_less_heat_and_work_is_conserved[pressed1]",
+            "features/monte_carlo/test_trajectories.py::test_energy_less_heat_and_work_is_conserved[pressed1]",
         ),
     ),
     Mutation(
@@ -414,7 +414,7 @@ RINGS = [
     Mutation(
         "D4",
         "surface tension: the pressure along the normal is less that of all axes, not of those across",
-        "analysis/built_in/interfaces.py",
+        "features/analysis/built_in/interfaces.py",
         "0.5 * slab.height * 1.5 * (normal",
         "0.5 * slab.height * (normal",
         (
@@ -434,7 +434,7 @@ RINGS = [
     Mutation(
         "D6",
         "responses: the total momentum that a run keeps at zero is missing in the heat capacity",
-        "analysis/built_in/thermodynamics.py",
+        "features/analysis/built_in/thermodynamics.py",
         "0.5 * BOLTZMANN * (3 * count + freedom.rotation)",
         "0.5 * BOLTZMANN * freedom.total",
         (
@@ -444,7 +444,7 @@ RINGS = [
     Mutation(
         "D7",
         "responses: what the subtraction of means hides is not added",
-        "analysis/built_in/thermodynamics.py",
+        "features/analysis/built_in/thermodynamics.py",
         "covariances.T + self.hidden / fraction",
         "covariances.T + 0 * self.hidden / fraction",
         ("features/analysis/test_thermodynamics.py::test_a_mean_that_is_subtracted_hides_nothing",),
@@ -452,7 +452,7 @@ RINGS = [
     Mutation(
         "D8",
         "responses: fluctuations at constant energy are those of the canonical ensemble",
-        "analysis/built_in/thermodynamics.py",
+        "features/analysis/built_in/thermodynamics.py",
         "factor = 1 / (1 - BOLTZMANN * of.xx / matter.counted)",
         "factor = 1 / (1 + BOLTZMANN * of.xx / matter.counted)",
         (

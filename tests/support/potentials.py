@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 import rigidmd
-from rigidmd.forces.potentials.custom import energy_and_force
+from rigidmd.features.potentials.sites.custom import energy_and_force
 from support.common import ROOT, site
 
 SCRIPTS = sorted((ROOT / "systems" / "scripts").glob("*.py"))

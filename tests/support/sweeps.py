@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from rigidmd.commands import cli
+from rigidmd.features.studies.sweep import sweeping
+from rigidmd.features.studies.sweep.folder import read_manifest
+from rigidmd.features.studies.sweep.plan import parse_axis
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
-from rigidmd.studies.sweep import sweeping
-from rigidmd.studies.sweep.folder import read_manifest
-from rigidmd.studies.sweep.plan import parse_axis
 
 ARGON = """
 [box]

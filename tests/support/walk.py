@@ -20,8 +20,8 @@ from typing import NamedTuple
 import tomli_w
 
 import rigidmd
-from rigidmd.analysis.registry import KNOWN, load_built_in
 from rigidmd.commands.cli import main
+from rigidmd.features.analysis.registry import known
 from rigidmd.scene import Scene
 from rigidmd.scene.base import override
 from rigidmd.scene.models import available_models, load_model
@@ -170,8 +170,7 @@ def commands_of(scene: Path) -> Iterator[tuple[str, list[str]]]:
     yield "energy --accuracy", ["energy", text, "--accuracy"]
     yield "run", ["run", text, "-o", run, "-v"]
     yield "analyse", ["analyse", run]
-    load_built_in()
-    for name in KNOWN:
+    for name in known():
         yield f"analyse --only {name}", ["analyse", run, "--only", name, "-v"]
     yield "report", ["report", run]
     yield "view", ["view", run]

@@ -7,6 +7,8 @@ import re
 import textwrap
 from importlib import import_module
 
+from rigidmd import PACKAGES
+
 #: Module -> names in their order; empty for all public names.
 MODULES = {
     "rigidmd": (),
@@ -25,11 +27,11 @@ MODULES = {
         "EngineError",
         "RigidMDWarning",
     ),
-    "rigidmd.analysis.result": ("AnalysisResult", "Value", "Curve"),
-    "rigidmd.studies.normal_modes": ("NormalModes",),
-    "rigidmd.studies.sweep.table": ("Table",),
+    "rigidmd.features.analysis.result": ("AnalysisResult", "Value", "Curve"),
+    "rigidmd.features.studies.normal_modes": ("NormalModes",),
+    "rigidmd.features.studies.sweep.table": ("Table",),
     "rigidmd.engines.observables": ("Observation",),
-    "rigidmd.engines.body_system": ("Pose",),
+    "rigidmd.features.bodies.system": ("Pose",),
     "rigidmd.core.state": ("State",),
 }
 PROPERTIES = (property, functools.cached_property)
@@ -56,7 +58,8 @@ def page() -> str:
         " these functions return. You do not import them.",
     ]
     for name, names in MODULES.items():
-        module = import_module(name)
+        short = name.removeprefix("rigidmd.")
+        module = import_module(f"rigidmd.features.{PACKAGES[short]}" if short in PACKAGES else name)
         title, _, _ = (module.__doc__ or "").partition("\n\n")
         parts += [f"## {name}", _text(" ".join(title.split()))]
         for public in names or sorted(module.__all__):

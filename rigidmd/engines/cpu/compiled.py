@@ -42,8 +42,8 @@ from rigidmd.forces.terms import (
 from rigidmd.mechanics.free_rotor import NO_SYMMETRY, ExactRotor, SplitRotor
 
 if TYPE_CHECKING:
-    from rigidmd.dynamics.body_step_loop import Body
     from rigidmd.dynamics.model import Model
+    from rigidmd.features.bodies.step_loop import Body
 
 #: Owner of arrays in `Engine.memory` besides the terms.
 LOAD = "load"

@@ -12,7 +12,6 @@ from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import BEHIND_WALL, Load, State
 from rigidmd.dynamics.barostats import barostat_workspace
 from rigidmd.dynamics.force_gradient import gradient_workspace
-from rigidmd.dynamics.hybrid_monte_carlo import trajectory_workspace
 from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.observables import LargestValues, StateSums
 from rigidmd.dynamics.step_loop import Advance, CouplingWorkspaces
@@ -26,6 +25,7 @@ from rigidmd.engines.cpu.compiled import (
 )
 from rigidmd.engines.protocol import Tally
 from rigidmd.errors import SimulationError
+from rigidmd.features.monte_carlo.trajectories import trajectory_workspace
 from rigidmd.forces.fields.walls import LennardJonesWalls
 from rigidmd.forces.terms import Setup, TermDispatcher
 

@@ -11,6 +11,8 @@ from numba import types
 from rigidmd.compile import chosen_by_type, implements, is_a, kernel
 from rigidmd.compile.simd import inverse, inverse_square_root, load, polynomial, zeros
 from rigidmd.errors import SceneError
+from rigidmd.features.free_energy.keys import Coupling
+from rigidmd.features.free_energy.soft_core import soft_core, tail_of_soft_core
 from rigidmd.forces.ewald.smooth import InverseR6
 from rigidmd.forces.neighbors import pair_loop as pairs
 from rigidmd.forces.neighbors.pair_loop import PairForces
@@ -26,7 +28,6 @@ from rigidmd.forces.parts import (
     sum_of_tails,
 )
 from rigidmd.forces.potentials.screened_coulomb import Screening, dispersion_screening
-from rigidmd.forces.potentials.soft_core import soft_core, tail_of_soft_core
 from rigidmd.forces.potentials.truncation import (
     MINIMUM_TOLERANCE,
     NO_SWITCH,
@@ -47,7 +48,6 @@ from rigidmd.forces.potentials.truncation import (
     truncation_of,
     truncation_terms,
 )
-from rigidmd.scene.coupling import Coupling
 from rigidmd.scene.forces import TruncationName
 from rigidmd.scene.models import Mixing, Molecule
 from rigidmd.units import KJ_PER_MOL

@@ -12,11 +12,11 @@ from rigidmd.assemble.harmonic import stable_angle
 from rigidmd.assemble.time_step import fastest_motion
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import NOW, State
-from rigidmd.dynamics.hybrid_monte_carlo import CHANCES, ENDED
 from rigidmd.dynamics.observables import sums_of_state
 from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
 from rigidmd.errors import SimulationError
+from rigidmd.features.monte_carlo.trajectories import CHANCES, ENDED
 from rigidmd.run.pilot.choice import round_down
 from rigidmd.run.stable_step import stiffest_mode
 from rigidmd.scene.stage import Stage

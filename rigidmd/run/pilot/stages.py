@@ -8,13 +8,13 @@ from rigidmd.assemble.time_step import fastest_of_scene
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.state import State
 from rigidmd.dynamics.observables import sums_of_state
-from rigidmd.engines.body_system import Pose
 from rigidmd.engines.system import System
+from rigidmd.features.bodies.keys.body import SAMPLES
+from rigidmd.features.bodies.system import Pose
 from rigidmd.run.pilot.choice import choose
 from rigidmd.run.pilot.sampling import choose_for_averages, choose_for_sampling
 from rigidmd.run.trial_systems import SPAN_PS, body_trial_system, molecular_trial_system
 from rigidmd.scene import BodyScene
-from rigidmd.scene.body import SAMPLES
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BOLTZMANN, FEMTOSECOND
 

@@ -8,7 +8,7 @@ import rigidmd
 from rigidmd.assemble.build import build, integrator_of_stage
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.engines.cpu.engine import CpuEngine as Engine
-from rigidmd.engines.external import compare_at
+from rigidmd.features.external.engines import compare_at
 
 
 @pytest.mark.parametrize("density", [1.4, 1.95, 2.6])

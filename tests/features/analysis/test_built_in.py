@@ -5,24 +5,24 @@ import pytest
 from support.common import history, system_of
 from support.frames import brownian
 
-from rigidmd.analysis.built_in.rotation import PER_CM, spectrum
-from rigidmd.analysis.built_in.structure import (
+from rigidmd.core.statistics import steady_from
+from rigidmd.errors import OutputError
+from rigidmd.features.analysis.built_in.rotation import PER_CM, spectrum
+from rigidmd.features.analysis.built_in.structure import (
     density_profile,
     hydrogen_bonds,
     rdf,
     structure_factor,
 )
-from rigidmd.analysis.built_in.transport import (
+from rigidmd.features.analysis.built_in.transport import (
     NM2_PER_S,
     correlation,
     diffusion,
     msd,
     squared_displacement,
 )
-from rigidmd.analysis.result import converged_value
-from rigidmd.analysis.runs import Runs
-from rigidmd.core.statistics import steady_from
-from rigidmd.errors import OutputError
+from rigidmd.features.analysis.result import converged_value
+from rigidmd.features.analysis.runs import Runs
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.units import BOLTZMANN
 

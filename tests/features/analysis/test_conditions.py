@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from support.common import history, small_scene
 
-from rigidmd.analysis.options import check_options, options_of
-from rigidmd.analysis.registry import KNOWN
-from rigidmd.analysis.runs import Runs
 from rigidmd.assemble.build import build
 from rigidmd.errors import OutputError
+from rigidmd.features.analysis.options import check_options, options_of
+from rigidmd.features.analysis.registry import known
+from rigidmd.features.analysis.runs import Runs
 from rigidmd.mechanics.rotation import random_rotations
 
 EDGE, COUNT, FRAMES = 16.0, 12, 60
@@ -56,7 +56,7 @@ def made_up(stages=(NVT,), molecules=None, edge=EDGE, frames=FRAMES, **sections)
 
 def refused(name, frames, /, **options):
     with pytest.raises(OutputError) as caught:
-        KNOWN[name].function(frames, **options)
+        known()[name].function(frames, **options)
     return str(caught.value)
 
 
@@ -75,7 +75,7 @@ def test_values_of_equilibrium_are_refused_on_a_ramp(stage, words):
             found.startswith(f"{name} needs constant conditions: in the stage") and words in found
         )
     for name in OF_AVERAGES:
-        assert KNOWN[name].function(frames, **({"axis": "z"} if name == "nematic" else {})).curves
+        assert known()[name].function(frames, **({"axis": "z"} if name == "nematic" else {})).curves
 
 
 def test_frames_of_stages_that_differ_are_refused_with_the_time_to_begin_at():
@@ -87,17 +87,17 @@ def test_frames_of_stages_that_differ_are_refused_with_the_time_to_begin_at():
         assert refused(name, mixed) == f"{name} needs constant conditions: {words}"
     # a stage begins with the last sample of the one before it
     first = replace(frames, columns=frames.columns | {"stage": np.minimum(1, np.arange(FRAMES))})
-    assert KNOWN["dielectric"].function(first).values
+    assert known()["dielectric"].function(first).values
     # averages mix them, with a note
-    (note,) = [text for text in KNOWN["rdf"].function(mixed).notes if "together" in text]
+    (note,) = [text for text in known()["rdf"].function(mixed).notes if "together" in text]
     assert note == "of the stages after, nvt together; from 2 ps on frames are of the last one"
-    assert not [text for text in KNOWN["rdf"].function(first).notes if "together" in text]
+    assert not [text for text in known()["rdf"].function(first).notes if "together" in text]
 
 
 @pytest.mark.parametrize("frames", [2, 9, FRAMES])
 def test_no_analysis_has_a_value_without_an_error(frames):
     made = made_up(frames=frames)
-    for name, entry in KNOWN.items():
+    for name, entry in known().items():
         if entry.is_user:
             continue
         try:
@@ -118,7 +118,7 @@ def test_samples_of_hybrid_monte_carlo_have_no_motion():
     frames = made_up([NVT | {"thermostat": "hybrid_monte_carlo"}])
     for name in IN_TIME:
         assert "needs motion in time, and the stage nvt samples by hybrid" in refused(name, frames)
-    assert KNOWN["dielectric"].function(frames).values
+    assert known()["dielectric"].function(frames).values
 
 
 def test_a_field_that_oscillates_has_no_equilibrium():
@@ -126,7 +126,7 @@ def test_a_field_that_oscillates_has_no_equilibrium():
     frames = made_up(fields=field)
     for name in OF_EQUILIBRIUM:
         assert "static forces, and these depend on time: electric_field" in refused(name, frames)
-    assert KNOWN["msd"].function(frames).curves
+    assert known()["msd"].function(frames).curves
 
 
 def test_what_is_missing_in_a_run_is_named():
@@ -143,8 +143,8 @@ def test_what_is_missing_in_a_run_is_named():
         "viscosity",
     ):
         assert refused(name, open_space).startswith(f"{name} needs a box")
-    for name in KNOWN:
-        if name not in ("response", "viscosity") and not KNOWN[name].is_user:
+    for name in known():
+        if name not in ("response", "viscosity") and not known()[name].is_user:
             assert refused(name, frames[:1]).startswith(f"{name} needs the frames of a trajectory")
 
 
@@ -167,7 +167,7 @@ def water():
 
 def test_options_beyond_their_range_are_refused_in_one_sentence(water):
     seeds = (0, 10**6 + 1)
-    for name, entry in KNOWN.items():
+    for name, entry in known().items():
         for key, option in {} if entry.is_user else options_of(entry.function).items():
             for value in EXTREMES[kind_of(option)]:
                 if (value is None and option.default is None) or (key == "seed" and value in seeds):
@@ -178,7 +178,7 @@ def test_options_beyond_their_range_are_refused_in_one_sentence(water):
 
 
 def test_options_at_the_ends_of_their_range_are_right_or_refused(water):
-    for entry in KNOWN.values():
+    for entry in known().values():
         for key, option in {} if entry.is_user else options_of(entry.function).items():
             limits = next(iter(getattr(option.annotation, "__metadata__", ())), None)
             for value in limits or ():
@@ -192,6 +192,6 @@ def test_options_at_the_ends_of_their_range_are_right_or_refused(water):
 
 def test_options_are_checked_on_the_command_line_before_frames_are_read():
     with pytest.raises(OutputError, match=r"^trials: 'many' is not like trials=1000$"):
-        check_options([KNOWN["insertion"].function], {"trials": "many"})
+        check_options([known()["insertion"].function], {"trials": "many"})
     with pytest.raises(OutputError, match=r"unknown option 'trial'.* trials"):
-        check_options([KNOWN["insertion"].function], {"trial": 3})
+        check_options([known()["insertion"].function], {"trial": 3})

@@ -9,11 +9,11 @@ import pytest
 from support.common import history, noise_with_memory, small_scene, system_of
 
 from rigidmd import Scene, Simulation
-from rigidmd.analysis.built_in.interfaces import interfaces, slab_of, surface_tension
-from rigidmd.analysis.runs import Runs
 from rigidmd.assemble.build import build
 from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.errors import OutputError, SceneError
+from rigidmd.features.analysis.built_in.interfaces import interfaces, slab_of, surface_tension
+from rigidmd.features.analysis.runs import Runs
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.units import BAR, GRAM_PER_CM3, KJ_PER_MOL
 

@@ -13,17 +13,17 @@ from scipy.spatial.transform import Rotation
 from support.common import built, small_scene
 from support.reference import inverse_power
 
-from rigidmd.analysis.built_in.rotation import dielectric, orientation, spectrum
-from rigidmd.analysis.built_in.structure import (
+from rigidmd.assemble.build import build
+from rigidmd.features.analysis.built_in.rotation import dielectric, orientation, spectrum
+from rigidmd.features.analysis.built_in.structure import (
     density_profile,
     hydrogen_bonds,
     rdf,
     structure_factor,
 )
-from rigidmd.analysis.built_in.transport import msd
-from rigidmd.analysis.rigid_frames import RigidFrames
-from rigidmd.assemble.build import build
-from rigidmd.engines.external import compare_at
+from rigidmd.features.analysis.built_in.transport import msd
+from rigidmd.features.analysis.rigid_frames import RigidFrames
+from rigidmd.features.external.engines import compare_at
 
 GRAM_PER_CM3 = 1 / 1.66053906660  # u/Å³
 KELVIN = 1.380649e-23 / 1.66053906660e-27 * 1e20 / 1e24  # u Å²/ps²

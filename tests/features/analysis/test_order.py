@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from support.common import history, system_of
 
-from rigidmd.analysis.built_in.order import nematic
 from rigidmd.errors import OutputError
+from rigidmd.features.analysis.built_in.order import nematic
 from rigidmd.mechanics.rotation import random_rotations
 
 

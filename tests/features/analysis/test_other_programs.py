@@ -11,10 +11,10 @@ from MDAnalysis.analysis.rdf import InterRDF
 from support.common import ROOT, gmx
 
 from rigidmd import Scene
-from rigidmd.analysis import registry
-from rigidmd.analysis.built_in.rotation import total_dipole
-from rigidmd.analysis.rigid_frames import frames_of_folder
 from rigidmd.assemble.build import build
+from rigidmd.features.analysis import registry
+from rigidmd.features.analysis.built_in.rotation import total_dipole
+from rigidmd.features.analysis.rigid_frames import frames_of_folder
 from rigidmd.run.record import read_record
 from rigidmd.units import DEBYE
 

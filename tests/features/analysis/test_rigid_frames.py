@@ -5,12 +5,10 @@ import pytest
 from support.common import history, small_scene, system_of
 from support.frames import TRICLINIC, brownian
 
-from rigidmd.analysis.built_in.transport import (
-    msd,
-)
-from rigidmd.analysis.rigid_frames import fit_frames
 from rigidmd.assemble.build import build
 from rigidmd.errors import OutputError
+from rigidmd.features.analysis.built_in.transport import msd
+from rigidmd.features.analysis.rigid_frames import fit_frames
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.run.rigid_fit import kinds_of
 

@@ -8,10 +8,10 @@ import pytest
 from support.common import history, small_scene, system_of
 from support.frames import rotations_about
 
-from rigidmd.analysis.built_in.rotation import dielectric, orientation
-from rigidmd.analysis.runs import Runs
 from rigidmd.assemble.build import build
 from rigidmd.errors import OutputError
+from rigidmd.features.analysis.built_in.rotation import dielectric, orientation
+from rigidmd.features.analysis.runs import Runs
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.units import BOLTZMANN, COULOMB
 

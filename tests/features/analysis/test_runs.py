@@ -16,12 +16,12 @@ from support.common import ROOT, small_scene
 
 import rigidmd
 from rigidmd import Scene, Simulation
-from rigidmd.analysis import registry
-from rigidmd.analysis.files import read_table
-from rigidmd.analysis.rigid_frames import frames_of_folder
 from rigidmd.assemble.build import build
 from rigidmd.commands import cli
 from rigidmd.errors import OutputError, SceneError
+from rigidmd.features.analysis import registry
+from rigidmd.features.analysis.files import read_table
+from rigidmd.features.analysis.rigid_frames import frames_of_folder
 from rigidmd.run.record import read_record
 
 
@@ -489,10 +489,12 @@ def test_adding_an_analysis_takes_one_file(tmp_path, monkeypatch, copy, capsys):
     )
     monkeypatch.setattr(registry, "KNOWN", registry.KNOWN.copy())
     monkeypatch.setattr(
-        rigidmd.analysis.built_in, "__path__", [*rigidmd.analysis.built_in.__path__, str(tmp_path)]
+        rigidmd.features.analysis.built_in,
+        "__path__",
+        [*rigidmd.features.analysis.built_in.__path__, str(tmp_path)],
     )
     registry.load_built_in()
-    monkeypatch.delitem(sys.modules, "rigidmd.analysis.built_in.cosines")
+    monkeypatch.delitem(sys.modules, "rigidmd.features.analysis.built_in.cosines")
     results = Simulation(Scene.read(ROOT / "systems" / "water.toml", SHORT)).run()
     found = rigidmd.analysis.mean_cosine(results, "x", power=2, start=0.0)
     assert found.value("x").value == pytest.approx((results.rotation[:, :, 0, 2] ** 2).mean())

@@ -5,13 +5,13 @@ import pytest
 from support.common import history, system_of
 from support.frames import TRICLINIC, rotations_about
 
-from rigidmd.analysis.built_in.structure import (
+from rigidmd.features.analysis.built_in.structure import (
     density_profile,
     hydrogen_bonds,
     rdf,
     structure_factor,
 )
-from rigidmd.analysis.pair_histogram import count_pairs, heights
+from rigidmd.features.analysis.pair_histogram import count_pairs, heights
 
 
 # structure

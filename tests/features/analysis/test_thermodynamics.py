@@ -12,10 +12,10 @@ from support.common import history, site, system_of
 
 import rigidmd
 from rigidmd import Scene, Simulation
-from rigidmd.analysis.built_in.thermodynamics import response
-from rigidmd.analysis.runs import Runs
 from rigidmd.commands.cli import main
 from rigidmd.errors import OutputError
+from rigidmd.features.analysis.built_in.thermodynamics import response
+from rigidmd.features.analysis.runs import Runs
 from rigidmd.units import BAR, BOLTZMANN, KJ_PER_MOL
 
 R = 1e3 * BOLTZMANN / KJ_PER_MOL  # J/(mol K)

@@ -10,17 +10,11 @@ from scipy.signal import lfilter
 from support.common import history, noise_with_memory, system_of
 from support.frames import TRICLINIC, brownian
 
-from rigidmd.analysis.built_in import transport
-from rigidmd.analysis.built_in.rotation import orientation
-from rigidmd.analysis.built_in.transport import (
-    MPA_S,
-    NM2_PER_S,
-    diffusion,
-    msd,
-    viscosity,
-)
-from rigidmd.analysis.runs import Runs
 from rigidmd.errors import OutputError
+from rigidmd.features.analysis.built_in import transport
+from rigidmd.features.analysis.built_in.rotation import orientation
+from rigidmd.features.analysis.built_in.transport import MPA_S, NM2_PER_S, diffusion, msd, viscosity
+from rigidmd.features.analysis.runs import Runs
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.units import BAR, BOLTZMANN
 

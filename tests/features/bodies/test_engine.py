@@ -9,13 +9,13 @@ from support.bodies import FREE, end, simulate, solve
 from support.common import move
 from support.scenes import PINNED
 
-from rigidmd.assemble.body import build_body
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.state import state_of
-from rigidmd.dynamics.body_step_loop import Body
-from rigidmd.engines.cpu.body import BodyEngine
 from rigidmd.errors import SceneError, SimulationError
-from rigidmd.forces.body.applied import SteadyForce
+from rigidmd.features.bodies.assemble import build_body
+from rigidmd.features.bodies.cpu_engine import BodyEngine
+from rigidmd.features.bodies.forces.applied import SteadyForce
+from rigidmd.features.bodies.step_loop import Body
 from rigidmd.mechanics.free_rotor import split_rotor
 from rigidmd.mechanics.rotation import from_vector, hat, random_rotations
 from rigidmd.mechanics.translation import NoTranslation

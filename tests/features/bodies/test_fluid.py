@@ -6,8 +6,8 @@ from numba import njit
 from scipy.integrate import solve_ivp
 from support.bodies import FLUID, FREE, end, kirchhoff_end, simulate
 
-from rigidmd.assemble.body import build_body
-from rigidmd.forces.body import resistance
+from rigidmd.features.bodies.assemble import build_body
+from rigidmd.features.bodies.forces import resistance
 from rigidmd.mechanics.rotation import from_vector
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene

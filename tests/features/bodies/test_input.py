@@ -6,8 +6,8 @@ import tomllib
 import pytest
 from support.common import ROOT
 
-from rigidmd.assemble.body import build_body
 from rigidmd.errors import SceneError
+from rigidmd.features.bodies.assemble import build_body
 from rigidmd.scene import Scene
 
 RUN = {"duration_s": 1.0, "timestep_s": 0.01}

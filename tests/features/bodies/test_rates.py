@@ -12,8 +12,8 @@ from support.common import ROOT
 
 import rigidmd
 from rigidmd.commands.cli import main
-from rigidmd.run.body_theory import free_body_period, heavy_top_motion
-from rigidmd.run.elliptic import complete, rf, rj
+from rigidmd.features.bodies.elliptic import complete, rf, rj
+from rigidmd.features.bodies.theory import free_body_period, heavy_top_motion
 
 SYSTEMS = ROOT / "systems"
 #: A top whose spin is fast enough for steady precession at 30°.

@@ -13,10 +13,10 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from support.common import BODIES, ROOT, same_bits
 
 import rigidmd
-from rigidmd.assemble.body import build_body
 from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError, SimulationError, StructureError
-from rigidmd.figures.picture import Picture
+from rigidmd.features.bodies.assemble import build_body
+from rigidmd.features.view.figures.picture import Picture
 from rigidmd.io.scene_file import write_scene
 from rigidmd.run import Every, Simulation
 from rigidmd.run.record import read_record
@@ -457,7 +457,7 @@ assert main(["run", sys.argv[1], "--set", "run.duration_s=0.01", "--output", sys
     threshold, frozen, *loaded = done.stdout.splitlines()[-1].split()
     unused = {
         "ase",
-        "rigidmd.engines.ode.engine",
+        "rigidmd.features.bodies.ode.engine",
         "rigidmd.forces.ewald.pme",
         "rigidmd.run.molecular",
         "rigidmd.view",

@@ -11,9 +11,9 @@ from support.common import BODIES, ROOT, move
 from rigidmd.compile import kernel
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.state import state_of
-from rigidmd.dynamics.body_step_loop import Body
-from rigidmd.engines.cpu.body import BodyEngine
 from rigidmd.errors import SimulationError
+from rigidmd.features.bodies.cpu_engine import BodyEngine
+from rigidmd.features.bodies.step_loop import Body
 from rigidmd.mechanics.free_rotor import ExactRotor, rotate, split_rotor
 from rigidmd.mechanics.rotation import from_vector, orthogonality_error, random_rotations
 from rigidmd.mechanics.translation import NoTranslation

@@ -15,10 +15,10 @@ from support.stops import contents, stopped_at
 
 import rigidmd
 from rigidmd import MolecularScene, Scene, Simulation
-from rigidmd.ase import RigidMD
 from rigidmd.assemble.build import build
 from rigidmd.commands import cli
 from rigidmd.errors import RigidMDError, RigidMDWarning, SceneError, StructureError
+from rigidmd.features.calculators.calculator import RigidMD
 from rigidmd.formats.through_ase import EV
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.run import Every

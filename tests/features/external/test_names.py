@@ -12,13 +12,13 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from rigidmd.assemble.build import build
-from rigidmd.engines.force_field import force_field_of
-from rigidmd.engines.gromacs import files as gromacs_files
-from rigidmd.engines.lammps import files as lammps_files
 from rigidmd.errors import OutputError, SceneError
+from rigidmd.features.external.force_field import force_field_of
+from rigidmd.features.external.gromacs import files as gromacs_files
+from rigidmd.features.external.lammps import files as lammps_files
+from rigidmd.features.studies.sweep.folder import Manifest, SweepPoint
+from rigidmd.features.studies.sweep.sweeping import write_slurm_script
 from rigidmd.scene import Scene
-from rigidmd.studies.sweep.folder import Manifest, SweepPoint
-from rigidmd.studies.sweep.sweeping import write_slurm_script
 
 PLAIN = ("one", "two", "first", "AR", "RES")
 #: What some language obeys, at the ends of names and within them.
@@ -162,7 +162,7 @@ def test_names_change_no_setting_of_gromacs(usual, tmp_path, names):
 @example((EVIL[0], EVIL[1], "{stages}{title}{system}{kick}", '"""', "&"))
 def test_names_change_no_statement_of_the_script_for_openmm(usual, tmp_path, names):
     pytest.importorskip("openmm")
-    from rigidmd.engines.openmm.files import write_openmm
+    from rigidmd.features.external.openmm.files import write_openmm
 
     texts = []
     for drawn in (usual[1], force_field_of(build(named(names)))):
@@ -181,7 +181,9 @@ def script(folder, name, scene, trust):
     folder.mkdir(parents=True, exist_ok=True)
     manifest = Manifest(name, scene, {}, {}, {}, {}, points)
     manifest.folder = folder
-    with patch("rigidmd.studies.sweep.sweeping.trusted_by", lambda sweep, point, trust: trust):
+    with patch(
+        "rigidmd.features.studies.sweep.sweeping.trusted_by", lambda sweep, point, trust: trust
+    ):
         path, _ = write_slurm_script(manifest, 3600.0, 1, trust)
     return path.read_text()
 

@@ -14,15 +14,15 @@ from support.reference import Oracle
 from rigidmd.assemble.build import build
 from rigidmd.commands import cli
 from rigidmd.core.state import HEAT
-from rigidmd.engines.external import external_engine
-from rigidmd.engines.force_field import force_field_of
 from rigidmd.engines.observables import kinetic_energies
-from rigidmd.engines.openmm.engine import OpenmmEngine
-from rigidmd.engines.openmm.files import write_openmm
-from rigidmd.engines.openmm.system import TRANSLATIONS as table
 from rigidmd.engines.protocol import NotFiniteError
-from rigidmd.engines.rigid_bodies import RigidBodies, mass_points
 from rigidmd.errors import EngineError, SceneError
+from rigidmd.features.external.engines import external_engine
+from rigidmd.features.external.force_field import force_field_of
+from rigidmd.features.external.openmm.engine import OpenmmEngine
+from rigidmd.features.external.openmm.files import write_openmm
+from rigidmd.features.external.openmm.system import TRANSLATIONS as table
+from rigidmd.features.external.rigid_bodies import RigidBodies, mass_points
 from rigidmd.mechanics.inertia import inertia_tensor
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.run.record import read_record

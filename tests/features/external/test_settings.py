@@ -21,14 +21,14 @@ from support.common import ROOT, shaken, small_scene
 
 from rigidmd.assemble.build import build
 from rigidmd.assemble.time_step import MIXED_ERROR
-from rigidmd.engines.force_field import force_field_of
-from rigidmd.engines.gromacs.files import write_gromacs
-from rigidmd.engines.lammps import files
-from rigidmd.engines.openmm import engine
-from rigidmd.engines.openmm.files import write_openmm
-from rigidmd.engines.openmm.system import Group, integration_groups
 from rigidmd.errors import SceneError
-from rigidmd.programs import programs
+from rigidmd.features.external.force_field import force_field_of
+from rigidmd.features.external.gromacs.files import write_gromacs
+from rigidmd.features.external.lammps import files
+from rigidmd.features.external.openmm import engine
+from rigidmd.features.external.openmm.files import write_openmm
+from rigidmd.features.external.openmm.system import Group, integration_groups
+from rigidmd.features.external.programs import programs
 
 COUNTS = {"spce": 6, "nitrogen": 4}
 NVT = {"ensemble": "nvt", "temperature_K": 310.0, "duration_ps": 0.4, "timestep_fs": 2.0}
@@ -486,7 +486,7 @@ def test_the_error_of_mixed_precision_is_the_one_in_the_manual():
 # a new engine
 
 OPTIONS = """
-from rigidmd.programs import Option, Program
+from rigidmd.features.external.programs import Option, Program
 
 PROGRAM = Program(
     "Mirror", "it needs nothing", "mirror:TABLE", engine="mirror:MirrorEngine", installed="mirror:installed",
@@ -497,8 +497,8 @@ PROGRAM = Program(
 MIRROR = """
 import numpy as np
 
-from rigidmd.engines.external import ExternalEngine
-from rigidmd.engines.external import Key, Translations
+from rigidmd.features.external.engines import ExternalEngine
+from rigidmd.features.external.engines import Key, Translations
 
 TABLE = Translations("Mirror", (), (Key("thermostat", {None: "", "langevin": ""}),), (), ())
 
@@ -544,10 +544,10 @@ SCRIPT = """
 import contextlib, io, json, sys
 
 import rigidmd.engines
-import rigidmd.programs
+import rigidmd.features.external.programs
 
 rigidmd.engines.__path__.append(sys.argv[1] + "/engines")
-rigidmd.programs.__path__.append(sys.argv[1] + "/programs")
+rigidmd.features.external.programs.__path__.append(sys.argv[1] + "/programs")
 
 from rigidmd.commands import cli
 

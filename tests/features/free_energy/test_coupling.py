@@ -11,13 +11,13 @@ from support.reference import nearest
 from support.slopes import force_on, torque_on
 
 import rigidmd
-from rigidmd.analysis.free_energy import SampledLambda, free_energy_of
 from rigidmd.assemble.build import build, integrator_of_stage
 from rigidmd.commands.cli import main
 from rigidmd.core.state import state_of
 from rigidmd.engines.samples import lambda_column
 from rigidmd.errors import OutputError, SceneError
-from rigidmd.forces.potentials.soft_core import SOFTNESS, SoftCore
+from rigidmd.features.free_energy.estimate import SampledLambda, free_energy_of
+from rigidmd.features.free_energy.soft_core import SOFTNESS, SoftCore
 from rigidmd.scene.models import load_model
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 

@@ -9,20 +9,20 @@ from scipy.signal import lfilter
 from support.common import history, observe, shaken, small_scene
 
 import rigidmd
-from rigidmd.analysis.built_in.insertion import Trials, _profile
-from rigidmd.analysis.registry import KNOWN
-from rigidmd.analysis.runs import Runs
 from rigidmd.assemble.build import build
-from rigidmd.assemble.guest import CORE, Guest, model_named
 from rigidmd.commands.cli import main
 from rigidmd.core.state import state_of
 from rigidmd.core.statistics import mean_and_error
 from rigidmd.errors import OutputError
+from rigidmd.features.analysis.registry import known
+from rigidmd.features.analysis.runs import Runs
+from rigidmd.features.free_energy.guest import CORE, Guest, model_named
+from rigidmd.features.free_energy.insertion import Trials, _profile
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.scene.models import load_model
 from rigidmd.units import BAR, BOLTZMANN, KJ_PER_MOL
 
-insertion = KNOWN["insertion"].function
+insertion = known()["insertion"].function
 TRICLINIC = {"lengths_A": [17.0, 16.0, 18.0], "angles_deg": [80.0, 95.0, 100.0]}
 CUBE = {"lengths_A": 13.0}
 SUM = {"cutoff_A": 5.5, "ewald_cutoff_A": 5.5, "ewald_alpha_per_A": 0.5}

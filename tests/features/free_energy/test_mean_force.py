@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 import rigidmd
-from rigidmd.analysis.mean_force import Window, potential_of_mean_force
 from rigidmd.commands.cli import main
 from rigidmd.errors import OutputError
+from rigidmd.features.free_energy.mean_force import Window, potential_of_mean_force
 
 KT = 0.78  # kJ/mol
 STIFFNESS = 9.0

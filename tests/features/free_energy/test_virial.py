@@ -10,9 +10,9 @@ from scipy.integrate import quad
 import rigidmd
 from rigidmd.commands.cli import main
 from rigidmd.errors import MoleculeError, SceneError, SimulationError
+from rigidmd.features.free_energy import virial
+from rigidmd.features.free_energy.virial import CM3_PER_MOL, Pair, integrate, second_virial
 from rigidmd.scene.models import available_models, load_model
-from rigidmd.studies import virial
-from rigidmd.studies.virial import CM3_PER_MOL, Pair, integrate, second_virial
 from rigidmd.units import BOLTZMANN, COULOMB, KJ_PER_MOL
 
 ARGON = load_model("argon")

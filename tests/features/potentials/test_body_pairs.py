@@ -15,15 +15,15 @@ import rigidmd
 from rigidmd import Scene, Simulation
 from rigidmd.assemble.build import build
 from rigidmd.core.statistics import slope
-from rigidmd.engines.body_pairs import bodies_of_potentials
 from rigidmd.errors import SceneError
-from rigidmd.figures.space import View, camera
-from rigidmd.figures.style import new_figure
-from rigidmd.forces.poses.formulas import formula_of_poses
-from rigidmd.forces.poses.gay_berne import GayBerne
+from rigidmd.features.potentials.poses.bodies import bodies_of_potentials
+from rigidmd.features.potentials.poses.formulas import formula_of_poses
+from rigidmd.features.potentials.poses.gay_berne import GayBerne
+from rigidmd.features.view.figures.space import View, camera
+from rigidmd.features.view.figures.style import new_figure
+from rigidmd.features.view.solids import solids_of
 from rigidmd.run.rigid_fit import Bodies
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
-from rigidmd.view.solids import solids_of
 
 
 def shuffled(simulation: Simulation, seed: int):

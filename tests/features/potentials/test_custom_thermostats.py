@@ -10,9 +10,9 @@ from support.potentials import POINTS, SCRIPTS, points
 
 import rigidmd
 from rigidmd.assemble.build import build
-from rigidmd.assemble.user_code.compiled import check_compiled_code
 from rigidmd.dynamics.noise import THERMOSTAT, Key, key_of, normals
 from rigidmd.errors import SceneError
+from rigidmd.features.potentials.user_code.compiled import check_compiled_code
 from rigidmd.run.checks import explain
 from rigidmd.run.failed_check import FailedCheck
 

@@ -5,7 +5,7 @@ import pytest
 from support.body_pairs import GAY_BERNE, ROD, brute_force, scene, simulation
 
 from rigidmd.assemble.build import build
-from rigidmd.forces.poses.pair_list import BUILDS, MUST_BUILD
+from rigidmd.features.potentials.poses.pair_list import BUILDS, MUST_BUILD
 from rigidmd.units import KJ_PER_MOL
 
 

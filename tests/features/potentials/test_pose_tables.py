@@ -9,9 +9,9 @@ from rigidmd import Scene, Simulation
 from rigidmd.assemble.build import build
 from rigidmd.compile import kernel
 from rigidmd.errors import SceneError
-from rigidmd.forces.poses.formulas import formula_of_poses
-from rigidmd.forces.poses.pairs import pair_slopes
-from rigidmd.forces.poses.table import read_body_table
+from rigidmd.features.potentials.poses.formulas import formula_of_poses
+from rigidmd.features.potentials.poses.pairs import pair_slopes
+from rigidmd.features.potentials.poses.table import read_body_table
 from rigidmd.run.checks import within_table
 from rigidmd.units import KJ_PER_MOL
 

@@ -9,11 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.body_pairs import DISC, ROD, evaluated, named
 
-from rigidmd.forces.poses.formulas import formula_of_poses
-from rigidmd.forces.poses.gay_berne import PARAMETERS, GayBerne
-from rigidmd.forces.poses.multipoles import dipole, quadrupole
-from rigidmd.forces.poses.patch import PARAMETERS as PATCH
-from rigidmd.forces.poses.patch import Patch
+from rigidmd.features.potentials.poses.formulas import formula_of_poses
+from rigidmd.features.potentials.poses.gay_berne import PARAMETERS, GayBerne
+from rigidmd.features.potentials.poses.multipoles import dipole, quadrupole
+from rigidmd.features.potentials.poses.patch import PARAMETERS as PATCH
+from rigidmd.features.potentials.poses.patch import Patch
 from rigidmd.units import COULOMB, DEBYE, KJ_PER_MOL
 
 BALL = {"length_A": 4.0, "width_A": 4.0, "epsilon_kJ_mol": 0.8, "side": 1.0, "end": 1.0}

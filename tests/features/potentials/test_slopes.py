@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from rigidmd.forces.poses.formulas import formula_of_poses
-from rigidmd.forces.poses.slopes import code_of, slopes_of
-from rigidmd.forces.poses.trace import Graph, TraceError
+from rigidmd.features.potentials.poses.formulas import formula_of_poses
+from rigidmd.features.potentials.poses.slopes import code_of, slopes_of
+from rigidmd.features.potentials.poses.trace import Graph, TraceError
 
 
 def traced(function, names):

@@ -12,8 +12,8 @@ import rigidmd
 from rigidmd.assemble.build import build
 from rigidmd.assemble.describe import describe
 from rigidmd.errors import SceneError
-from rigidmd.forces.potentials.formulas import FormulaError, formula_of_table
-from rigidmd.forces.potentials.text_formulas import formula_of_text
+from rigidmd.features.potentials.sites.formulas import FormulaError, formula_of_table
+from rigidmd.features.potentials.sites.text_formulas import formula_of_text
 from rigidmd.units import KJ_PER_MOL
 
 # --- formulas -------------------------------------------------------------------------------------

@@ -12,10 +12,10 @@ from support.common import small_scene
 from support.potentials import LJ, at_distance
 
 from rigidmd.assemble.build import build
-from rigidmd.forces.potentials import text_formulas
-from rigidmd.forces.potentials.custom import CustomOneKind
-from rigidmd.forces.potentials.formulas import FormulaError
-from rigidmd.forces.potentials.text_formulas import formula_of_text
+from rigidmd.features.potentials.sites import text_formulas
+from rigidmd.features.potentials.sites.custom import CustomOneKind
+from rigidmd.features.potentials.sites.formulas import FormulaError
+from rigidmd.features.potentials.sites.text_formulas import formula_of_text
 from rigidmd.forces.potentials.truncation import Unmodified
 from rigidmd.units import KJ_PER_MOL
 

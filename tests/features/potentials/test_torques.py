@@ -8,10 +8,10 @@ from support.common import site
 import rigidmd
 from rigidmd import Scene, Simulation
 from rigidmd.assemble.build import build
-from rigidmd.assemble.guest import Guest
 from rigidmd.errors import SceneError
+from rigidmd.features.free_energy.guest import Guest
+from rigidmd.features.free_energy.virial import second_virial
 from rigidmd.scene.models import read_molecule
-from rigidmd.studies.virial import second_virial
 
 
 def test_bodies_that_do_not_rotate_have_no_such_potential():

@@ -9,12 +9,12 @@ from support.potentials import POINTS, SCRIPTS, Pair, Spring, points
 
 import rigidmd
 from rigidmd.assemble.build import build
-from rigidmd.assemble.user_code.compiled import describe_compile_error
 from rigidmd.commands.cli import main
 from rigidmd.compile.cache import CacheIndex
 from rigidmd.compile.kernels import CompileError
 from rigidmd.core import user_modules
 from rigidmd.errors import SceneError
+from rigidmd.features.potentials.user_code.compiled import describe_compile_error
 
 # --- code in files --------------------------------------------------------------------------------
 
@@ -130,7 +130,7 @@ def test_errors_of_numba_have_no_colours():
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
 def test_every_example_of_an_extension_runs_and_is_short(path, monkeypatch):
-    from rigidmd.analysis import registry
+    from rigidmd.features.analysis import registry
 
     monkeypatch.setattr(registry, "KNOWN", dict(registry.KNOWN))
     assert len(path.read_text().splitlines()) <= 50

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from rigidmd.studies.accuracy.averages import (
+from rigidmd.features.studies.accuracy.averages import (
     UNSEEN,
     AveragedQuantity,
     AverageRun,
     Averages,
 )
-from rigidmd.studies.extrapolation import MeanAtStep, Together, extrapolate, means_of_runs
+from rigidmd.features.studies.extrapolation import MeanAtStep, Together, extrapolate, means_of_runs
 
 
 def test_the_limit_at_a_step_of_zero_is_shared_and_long_steps_are_left_out():

@@ -1,13 +1,12 @@
-"""Energy and volume at a step of 0 together: `studies/joint_fit.py`."""
+"""Energy and volume at a step of 0 together: `features/studies/joint_fit.py`."""
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
 from rigidmd import Scene, Simulation
-from rigidmd.run.record import read_record
-from rigidmd.studies.extrapolation import extrapolate
-from rigidmd.studies.joint_fit import (
+from rigidmd.features.studies.extrapolation import extrapolate
+from rigidmd.features.studies.joint_fit import (
     BALANCE,
     BAR_NM3,
     DENSITY,
@@ -23,7 +22,8 @@ from rigidmd.studies.joint_fit import (
     slope_name,
     why_not,
 )
-from rigidmd.studies.sweep.limits import JOINT, Limit
+from rigidmd.features.studies.sweep.limits import JOINT, Limit
+from rigidmd.run.record import read_record
 
 #: Atoms on springs of one frequency (rad/ps), each about a lattice point that moves with the box, and an
 #: energy of the volume for which U + pV is quadratic in it.

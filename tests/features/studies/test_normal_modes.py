@@ -16,12 +16,12 @@ from rigidmd.assemble.build import build
 from rigidmd.commands.cli import main
 from rigidmd.core.state import state_of
 from rigidmd.errors import SceneError, SimulationError
+from rigidmd.features.studies import normal_modes
+from rigidmd.features.studies.gamma_point import periodic_basis
 from rigidmd.io.trajectory import read_frames
 from rigidmd.run.record import read_record
 from rigidmd.run.stable_step import stiffest_mode
 from rigidmd.scene.models import load_model
-from rigidmd.studies import normal_modes
-from rigidmd.studies.gamma_point import periodic_basis
 from rigidmd.units import COULOMB, KJ_PER_MOL
 
 DIMER = ROOT / "systems" / "water_dimer.toml"

@@ -7,8 +7,8 @@ import pytest
 
 from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError
-from rigidmd.studies.stability import cases
-from rigidmd.studies.stability.cases import (
+from rigidmd.features.studies.stability import cases
+from rigidmd.features.studies.stability.cases import (
     BUILDERS,
     CASES,
     CRASH,
@@ -20,8 +20,8 @@ from rigidmd.studies.stability.cases import (
     Outcome,
     Trial,
 )
-from rigidmd.studies.stability.report import conclusions, table_text
-from rigidmd.studies.stability.runner import TrialResult, failure, longest_step, run_cases
+from rigidmd.features.studies.stability.report import conclusions, table_text
+from rigidmd.features.studies.stability.runner import TrialResult, failure, longest_step, run_cases
 
 CASE = Case("made_up", 1, "A case", [])
 

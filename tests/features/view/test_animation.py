@@ -12,10 +12,10 @@ from support.common import ROOT
 from support.pages import data_of, is_alone, numbers
 
 from rigidmd.commands import cli
+from rigidmd.features.view import animation as film
+from rigidmd.features.view import molecule_animation
+from rigidmd.features.view.animation import write_film
 from rigidmd.run.record import read_record
-from rigidmd.view import animation as film
-from rigidmd.view import molecule_animation
-from rigidmd.view.animation import write_film
 
 
 def test_numbers_that_are_none_are_refused(top, tmp_path, capsys):
@@ -144,7 +144,7 @@ def test_an_animation_as_mp4(top, tmp_path):
 
 
 def test_an_animation_of_a_periodic_motion_ends_where_it_began(top):
-    from rigidmd.view.body_animation import BodyAnimation
+    from rigidmd.features.bodies.animation import BodyAnimation
 
     film = BodyAnimation(read_record(top))
     assert film.loop_end() == (0.5, [])  # this top has fallen and risen, but rotated elsewhere

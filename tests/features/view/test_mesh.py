@@ -5,11 +5,11 @@ import pytest
 from support.common import ROOT
 
 from rigidmd import Scene, Simulation
-from rigidmd.assemble.body import build_body
 from rigidmd.commands import cli
+from rigidmd.features.bodies.assemble import build_body
+from rigidmd.features.bodies.mesh import UNITS, mesh_of
 from rigidmd.formats.bonds import connections
 from rigidmd.mechanics.inertia import SOLIDS, shifted_inertia, solid
-from rigidmd.view.mesh import UNITS, mesh_of
 
 
 def volume(mesh):

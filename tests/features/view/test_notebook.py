@@ -13,16 +13,16 @@ import pytest
 from support.common import ROOT, SYSTEMS, small_scene
 
 import rigidmd
-from rigidmd.analysis.result import AnalysisResult, Curve, Value
 from rigidmd.commands.cli import main
 from rigidmd.core.shipped import NOTEBOOKS
 from rigidmd.core.shipped import examples as examples_in
 from rigidmd.errors import RigidMDWarning
-from rigidmd.figures.style import save_files
+from rigidmd.features.analysis.result import AnalysisResult, Curve, Value
+from rigidmd.features.view import plots
+from rigidmd.features.view.figures.style import save_files
 from rigidmd.io import progress
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
-from rigidmd.view import plots
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"
 SHORT = {"run.duration_s": 0.05, "output.figures": False}

@@ -14,11 +14,11 @@ from support.pages import CHROMIUM, SHORT_WATER, data_of, is_alone, numbers
 
 from rigidmd import Scene, Simulation
 from rigidmd.commands import cli
+from rigidmd.features.view import molecule_animation
+from rigidmd.features.view.plots import plots_part
+from rigidmd.features.view.run_page import write_report
 from rigidmd.io.trajectory import Frames
 from rigidmd.run.record import read_record
-from rigidmd.view import molecule_animation
-from rigidmd.view.plots import plots_part
-from rigidmd.view.run_page import write_report
 
 in_browser = pytest.mark.skipif(
     not CHROMIUM, reason="Chromium is not installed: what a browser shows is not tested"

@@ -16,8 +16,8 @@ from rigidmd.assemble.build import build
 from rigidmd.assemble.describe import describe
 from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.core.statistics import slope
-from rigidmd.engines.external import external_engine
 from rigidmd.errors import SceneError
+from rigidmd.features.external.engines import external_engine
 from rigidmd.run import Simulation
 from rigidmd.units import KJ_PER_MOL
 

@@ -3,7 +3,7 @@
 import pytest
 from support.common import small_scene
 
-from rigidmd.studies.accuracy import measurement
+from rigidmd.features.studies.accuracy import measurement
 
 
 @pytest.fixture(scope="module", autouse=True)

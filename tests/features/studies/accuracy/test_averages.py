@@ -11,15 +11,11 @@ from support.common import ROOT, SPRING, small_scene, springs
 from rigidmd.commands.cli import main
 from rigidmd.core.statistics import mean_and_error
 from rigidmd.errors import SceneError
+from rigidmd.features.studies.accuracy import averages, averages_report
+from rigidmd.features.studies.accuracy.accuracy import measure_accuracy
+from rigidmd.features.studies.accuracy.averages import measure_averages
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
-from rigidmd.studies.accuracy import averages, averages_report
-from rigidmd.studies.accuracy.accuracy import (
-    measure_accuracy,
-)
-from rigidmd.studies.accuracy.averages import (
-    measure_averages,
-)
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from support.accuracy import FOURTH, made
 
-from rigidmd.studies.accuracy.orders import convergence, fitted_order
+from rigidmd.features.studies.accuracy.orders import convergence, fitted_order
 
 
 @pytest.mark.parametrize(

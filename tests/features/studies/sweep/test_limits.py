@@ -9,10 +9,10 @@ import pytest
 from support.sweeps import ARGON, run_here, table
 
 from rigidmd.commands import cli
-from rigidmd.studies.extrapolation import extrapolate
-from rigidmd.studies.sweep import limits, sweeping
-from rigidmd.studies.sweep.plan import parse_axis
-from rigidmd.studies.sweep.table import POTENTIAL
+from rigidmd.features.studies.extrapolation import extrapolate
+from rigidmd.features.studies.sweep import limits, sweeping
+from rigidmd.features.studies.sweep.plan import parse_axis
+from rigidmd.features.studies.sweep.table import POTENTIAL
 
 STEP = "stages.0.timestep_fs"
 

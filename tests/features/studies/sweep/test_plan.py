@@ -5,11 +5,11 @@ import re
 import pytest
 
 from rigidmd.errors import SceneError
+from rigidmd.features.studies.sweep import sweeping
+from rigidmd.features.studies.sweep.folder import point_name, short_keys, value_name
+from rigidmd.features.studies.sweep.plan import Axis, parse_axis, settings
 from rigidmd.scene import parse_override
 from rigidmd.scene.base import format_override
-from rigidmd.studies.sweep import sweeping
-from rigidmd.studies.sweep.folder import point_name, short_keys, value_name
-from rigidmd.studies.sweep.plan import Axis, parse_axis, settings
 
 
 @pytest.mark.parametrize(

@@ -17,12 +17,12 @@ from support.sweeps import GRID, run_here, states, written
 
 from rigidmd.commands import cli
 from rigidmd.errors import OutputError
+from rigidmd.features.studies.sweep import points as sweep_points
+from rigidmd.features.studies.sweep import sweeping
+from rigidmd.features.studies.sweep.folder import read_manifest
+from rigidmd.features.studies.sweep.points import format_walltime, wait_for_folder
 from rigidmd.io.folder import FolderLock
 from rigidmd.io.progress import progress_of
-from rigidmd.studies.sweep import points as sweep_points
-from rigidmd.studies.sweep import sweeping
-from rigidmd.studies.sweep.folder import read_manifest
-from rigidmd.studies.sweep.points import format_walltime, wait_for_folder
 
 
 def same_runs(first, second):

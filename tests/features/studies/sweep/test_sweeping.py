@@ -11,13 +11,13 @@ import pytest
 from support.sweeps import ARGON, GRID, states, table, written
 
 import rigidmd
-from rigidmd.analysis import registry
 from rigidmd.commands import cli
 from rigidmd.errors import OutputError, RigidMDWarning
+from rigidmd.features.analysis import registry
+from rigidmd.features.studies.sweep import sweeping
+from rigidmd.features.studies.sweep.folder import read_manifest
+from rigidmd.features.studies.sweep.plan import Axis
 from rigidmd.io.folder import FolderLock
-from rigidmd.studies.sweep import sweeping
-from rigidmd.studies.sweep.folder import read_manifest
-from rigidmd.studies.sweep.plan import Axis
 
 
 def test_a_sweep_is_a_folder_a_point_a_table_and_a_figure(finished):

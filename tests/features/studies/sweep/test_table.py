@@ -9,12 +9,12 @@ from support.common import ROOT
 from support.sweeps import ARGON, run_here, table
 
 from rigidmd.commands import cli
+from rigidmd.features.studies.sweep import figure, sweeping
+from rigidmd.features.studies.sweep.figure import axis_label
+from rigidmd.features.studies.sweep.plan import parse_axis
+from rigidmd.features.studies.sweep.table import SweepRow, summarise_run
+from rigidmd.features.studies.sweep.table import Table as SweepTable
 from rigidmd.run.record import read_record
-from rigidmd.studies.sweep import figure, sweeping
-from rigidmd.studies.sweep.figure import axis_label
-from rigidmd.studies.sweep.plan import parse_axis
-from rigidmd.studies.sweep.table import SweepRow, summarise_run
-from rigidmd.studies.sweep.table import Table as SweepTable
 
 
 def test_the_energy_of_a_molecule_has_its_fraction_of_the_error(finished):

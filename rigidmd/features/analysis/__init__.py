@@ -1,0 +1,1 @@
+"""Analyses of runs of molecules, each with its error."""

@@ -1,0 +1,193 @@
+"""`rigidmd analyse`."""
+
+import argparse
+from pathlib import Path
+
+from rigidmd.commands import FAILED
+from rigidmd.commands.arguments import Options, argument, command, flag, number, repeated, time_ps
+from rigidmd.commands.streams import progress_bar
+
+FRAMES = 100  # equal ones, for insertion without a run
+
+
+class _List(argparse.Action):
+    def __call__(self, parser, *_):
+        from rigidmd.features.analysis.registry import analysis_order, known, selected
+        from rigidmd.features.free_energy import estimate as free_energy
+        from rigidmd.features.free_energy import mean_force
+
+        for entry in selected(sorted(known(), key=analysis_order)):
+            print(f"{entry.name:18} {entry.about}")
+        for of_sweep in (mean_force, free_energy):
+            print(f"{of_sweep.NAME:18} {of_sweep.ABOUT}, of a sweep")
+        parser.exit()
+
+
+@command(
+    120,
+    "measure g(r), diffusion, orientation, dielectric constant, viscosity and more in a run, each"
+    " with its error",
+    "rigidmd analyse runs/water --only rdf,diffusion --from 10ps",
+    argument(
+        "folder",
+        metavar="RUN",
+        help=(
+            "folder of a run, or of a sweep, whose runs are analysed together. For `insertion` also"
+            " a scene, into whose frozen molecules a model is inserted without a run"
+        ),
+    ),
+    argument(
+        "requests",
+        nargs="*",
+        metavar="NAME",
+        help=(
+            "analyses to run, like --only. KEY=VALUE sets one of their options, such as"
+            " `insertion model=krypton trials=5000`"
+        ),
+    ),
+    argument(
+        "--only",
+        type=lambda text: [name.strip() for name in text.split(",") if name.strip()],
+        default=[],
+        metavar="NAMES",
+        help="analyses to run, separated by commas (default: all). `--list` names them",
+    ),
+    argument(
+        "--from",
+        dest="start",
+        type=time_ps,
+        metavar="TIME",
+        help=(
+            "use frames from this time of the run onwards, such as 10ps (default: from where the"
+            " run is found to be equilibrated)"
+        ),
+    ),
+    argument(
+        "--viscosity",
+        type=number(float, 1e-6, 1e12, "a viscosity from 1e-6 to 1e12"),
+        metavar="VALUE",
+        help=(
+            "viscosity in mPa s for the finite-size correction of D (default: measured in the run)"
+        ),
+    ),
+    argument(
+        "--figures",
+        choices=["png", "svg", "pdf"],
+        default="png",
+        help="type of the figures (default: png)",
+    ),
+    argument(
+        "--extrapolate",
+        metavar="KEY",
+        help=(
+            "for a sweep: extrapolate all averages and values to a time step of 0. KEY is the"
+            " time step that the sweep varies, such as stages.1.timestep_fs"
+        ),
+    ),
+    repeated(
+        "--trust",
+        "FILE.py",
+        help=(
+            "run this Python file first. It may define analyses with @rigidmd.analysis.register."
+            " Can be repeated"
+        ),
+    ),
+    flag("-v", "--verbose", help="also print the notes of each analysis, and what its curves show"),
+    argument("--list", action=_List, nargs=0, help="list the analyses"),
+    scene="this run",
+    writes=True,
+)
+def _analyse(options: Options) -> int:
+    from rigidmd.errors import OutputError
+    from rigidmd.features.analysis.files import analyse_folder
+    from rigidmd.features.analysis.registry import run_user_file
+    from rigidmd.features.analysis.report import frames_text
+    from rigidmd.features.free_energy import estimate as free_energy
+    from rigidmd.features.free_energy import mean_force
+    from rigidmd.features.studies.commands.sweep import print_limits
+    from rigidmd.features.studies.sweep.folder import is_sweep, read_manifest
+    from rigidmd.features.studies.sweep.replicas import ANALYSES, analyse_sweep
+    from rigidmd.io.folder import check_is_run
+    from rigidmd.scene import parse_override
+
+    for path in options.trust:
+        run_user_file(Path(path))
+    names = [*options.only, *(text for text in options.requests if "=" not in text)]
+    more = dict(parse_override(text) for text in options.requests if "=" in text)
+    if options.folder.endswith(".toml"):
+        return _insert(options.folder, names, more, verbose=options.verbose)
+    with progress_bar() as progress:
+        folder = Path(options.folder)
+        request = (names, options.start, options.viscosity)
+        if is_sweep(folder):
+            analysed = analyse_sweep(folder, *request, progress, options.figures, more)
+            progress(1.0, "")
+            for of in analysed:
+                runs = f"{of.runs} run{'s' if of.runs > 1 else ''}"
+                files = (
+                    f"{len(of.files)} files in {of.files[0].parent}" if of.files else "no results"
+                )
+                print(f"{of.title or folder}: {runs}, {files}")
+                _print_results(of.results, of.failed, verbose=options.verbose)
+                print()
+            print(f"values of all in {folder / ANALYSES}")
+            if options.extrapolate is not None:
+                files = print_limits(read_manifest(folder), options.extrapolate)
+                print(f"\n  files in {folder}: {', '.join(files)}")
+            return FAILED if names and any(of.failed for of in analysed) else 0
+        check_is_run(folder)
+        for of_sweep in (mean_force, free_energy):
+            if of_sweep.NAME in names:
+                raise OutputError(
+                    f"{of_sweep.NAME} needs a sweep over {of_sweep.OVER}, and {folder} is the"
+                    " folder of a run"
+                )
+        if options.extrapolate is not None:
+            raise OutputError(
+                f"--extrapolate needs a sweep over a time step, and {folder} is the folder of a run"
+            )
+        done = analyse_folder(folder, *request, progress, options.figures, more)
+    used = done.frames_used
+    text = frames_text(used["frames"], used["from_ps"], used["to_ps"])
+    print(f"{options.folder}: {text}")
+    for note in used["notes"]:
+        print(f"  {note}")
+    _print_results(done.results, done.failed, verbose=options.verbose)
+    print(
+        f"\n{len(done.files)} files in {options.folder}, values in {done.files[0].name}. `rigidmd"
+        " report` shows them"
+    )
+    return FAILED if names and done.failed else 0
+
+
+def _insert(path: str, names: list[str], more: dict[str, object], *, verbose: bool) -> int:
+    """Print the results of insertion into the frozen molecules of a scene."""
+    from rigidmd.errors import OutputError
+    from rigidmd.features.analysis.files import run_analyses
+    from rigidmd.features.analysis.options import check_options
+    from rigidmd.features.analysis.registry import known
+    from rigidmd.features.analysis.rigid_frames import frames_of_start
+    from rigidmd.features.analysis.runs import Runs
+    from rigidmd.scene import MolecularScene
+
+    if names != ["insertion"]:
+        raise OutputError(
+            f"{path} is a scene, and only insertion needs no run: `rigidmd analyse {path} insertion"
+            " model=NAME`, or `rigidmd run` first"
+        )
+    check_options([known()["insertion"].function], more)
+    model = str(more.get("model", ""))
+    runs = Runs((frames_of_start(MolecularScene.read(path), FRAMES, model),))
+    results, failed = run_analyses(runs, names, options={"zero_loading": True} | more)
+    for result in results:  # trials at rest have no time
+        result.values = [value._replace(correlation_ps=None) for value in result.values]
+    _print_results(results, failed, verbose=verbose)
+    return FAILED if failed else 0
+
+
+def _print_results(results: list, failed: dict[str, str], *, verbose: bool) -> None:
+    from rigidmd.features.analysis.report import results_text
+
+    print(*results_text(results, failed), sep="\n")
+    if verbose:
+        print(*("", *results), sep="\n")

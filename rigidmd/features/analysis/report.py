@@ -1,0 +1,59 @@
+"""The results of analyses as text for a terminal: values first, then what has none, and why."""
+
+from collections.abc import Mapping, Sequence
+
+from rigidmd.core.statistics import format_with_error
+from rigidmd.features.analysis.result import AnalysisResult, Value
+from rigidmd.io.write import columns_text
+from rigidmd.scene.validation import not_none
+
+HEADERS = ("quantity", "value", "unit", "correlation time (ps)")
+
+
+def frames_text(count: int, begin: float, end: float) -> str:
+    """What results are from, of times in ps."""
+    what = f"{count} frames" if count else "samples of the log, without frames,"
+    return f"{what} from {begin:g} to {end:g} ps"
+
+
+def results_text(results: Sequence[AnalysisResult], failed: Mapping[str, str]) -> list[str]:
+    """Lines with a table of all values, the values that a run is too short for, and the analyses
+    that were not possible.
+
+    failed : analysis -> a sentence on why
+    """
+    values = [value for result in results for value in result.values]
+    known = [value for value in values if value.value is not None]
+    missing = {value.name: value.note for value in values if value.value is None}
+    lines = []
+    if known:
+        table = columns_text([HEADERS, *map(_row, known)], left=(0, 1, 2))
+        lines = ["", *_indented(table.splitlines())]
+    lines += _section("Notes:", {value.name: value.note for value in known if value.note})
+    lines += _section("No value yet:", missing)
+    lines += _section("Not possible:", failed)
+    return lines
+
+
+def _row(value: Value) -> tuple[str, str, str, str]:
+    unit = "" if value.unit == "1" else value.unit
+    time = "" if value.correlation_ps is None else f"{value.correlation_ps:.3g}"
+    number = format_with_error(not_none(value.value), value.error)
+    return value.name, number, unit, time
+
+
+def _section(title: str, reasons: Mapping[str, str]) -> list[str]:
+    """A title and a line for each reason."""
+    return ["", title, *_indented(by_reason(reasons))] if reasons else []
+
+
+def by_reason(reasons: Mapping[str, str]) -> list[str]:
+    """A line for each reason with its names, which it does not repeat."""
+    names: dict[str, list[str]] = {}
+    for name, reason in reasons.items():
+        names.setdefault(reason.removeprefix(f"{name} "), []).append(name)
+    return [f"{', '.join(each)}: {reason}" for reason, each in names.items()]
+
+
+def _indented(lines: Sequence[str]) -> list[str]:
+    return [f"  {line}" for line in lines]

@@ -1,0 +1,290 @@
+"""Results of analyses: values with errors, curves, notes, and how errors are estimated."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from math import isfinite
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from rigidmd.core.display import Displayed
+from rigidmd.core.statistics import (
+    correlation_time,
+    error_of_mean,
+    format_with_error,
+    mean_and_error,
+)
+from rigidmd.features.analysis.rigid_frames import RigidFrames
+from rigidmd.features.analysis.runs import Measured, Runs
+from rigidmd.io.run_files import Bounded
+from rigidmd.run.rigid_fit import Kind
+
+if TYPE_CHECKING:
+    import pandas
+
+    from rigidmd.features.view.figures.picture import Picture
+
+#: Blocks of frames whose scatter gives errors. The error of an error is one third.
+BLOCKS = 5
+MAX_GROUPS = 10  # groups of molecules at most, whose scatter gives errors too
+#: Minimum length of a run for a value in correlation times of the whole system. For those of single
+#: molecules, of which there are many, it is `BLOCKS`, because each block should be one correlation
+#: time long.
+MIN_CORRELATION_TIMES = 20.0
+
+
+class Value(NamedTuple):
+    """A value with its standard error, or a note on why there is none.
+
+    correlation_ps : correlation time of the data
+    """
+
+    name: str
+    unit: str
+    value: Bounded | None
+    error: Bounded | None
+    correlation_ps: Bounded | None = None
+    note: str = ""
+
+    @property
+    def header(self) -> str:
+        """Name and unit, for tables."""
+        return f"{self.name} ({self.unit})" if self.unit not in ("", "1") else self.name
+
+    def __str__(self) -> str:
+        if self.value is None:
+            return f"{self.name}: {self.note}"
+        unit = "" if self.unit in ("", "1") else f" {self.unit}"
+        note = f" ({self.note})" if self.note else ""
+        return f"{self.name}: {format_with_error(self.value, self.error)}{unit}{note}"
+
+
+@dataclass(eq=False, repr=False)
+class Curve:
+    """Columns over an axis: one CSV file, one figure.
+
+    file : stem of its files
+    axis : header and values (p,)
+    columns, errors : header -> values (p,). Errors under the same headers, where there are any
+    log : whether axes are logarithmic: of x, of y
+    level : a level to draw, such as 1 of g(r)
+    bars : whether the axis is of whole numbers, and bars are drawn
+    """
+
+    file: str
+    axis: tuple[str, np.ndarray]
+    label: str
+    columns: dict[str, np.ndarray]
+    errors: dict[str, np.ndarray] = field(default_factory=dict)
+    log: tuple[bool, bool] = (False, False)
+    level: float | None = None
+    bars: bool = False
+
+    def __repr__(self) -> str:
+        """Short: the numbers of a curve would flood a screen."""
+        return (
+            f"<Curve {self.file}: {', '.join(self.columns)} against {self.axis[0]},"
+            f" {len(self.axis[1])} points>"
+        )
+
+    @property
+    def table(self) -> dict[str, np.ndarray]:
+        """The columns of its CSV file: the axis, and each column followed by its errors."""
+        table = dict([self.axis])
+        for header, values in self.columns.items():
+            table[header] = values
+            if header in self.errors:
+                table[f"{header} error"] = self.errors[header]
+        return table
+
+    def add(self, title: str, values: np.ndarray, errors: np.ndarray) -> None:
+        self.columns[title], self.errors[title] = values, errors
+
+
+@dataclass(eq=False, repr=False)
+class AnalysisResult(Displayed):
+    """The result of an analysis: values, curves, notes. A notebook displays them with a figure.
+
+    result["g OW-OW"] is a column of its curves, result.value("D of spce") a value. result.plot() is
+    a figure, result.to_dataframe() a table.
+    """
+
+    name: str
+    about: str
+    values: list[Value] = field(default_factory=list)
+    curves: list[Curve] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def __getitem__(self, column: str) -> np.ndarray:
+        """A column of its curves. Raises KeyError with all names."""
+        known: dict[str, np.ndarray] = {}
+        for curve in self.curves:
+            known |= curve.table
+        if column not in known:
+            raise KeyError(f"no column {column!r}; there are {', '.join(known)}")
+        return known[column]
+
+    def value(self, name: str = "") -> Value:
+        """The value of this name. Without a name the first. Raises KeyError with all names."""
+        for value in self.values:
+            if name in ("", value.name):
+                return value
+        raise KeyError(
+            f"no value {name!r}; there are {', '.join(value.name for value in self.values)}"
+        )
+
+    def plot(self, curve: str = "") -> "Picture":
+        """A Matplotlib figure of its curves, which a notebook displays and `savefig` writes, as
+        PNG, SVG or PDF by the extension. Bands are of one standard error.
+
+        curve : name of one of `curves`. Default: a panel for each. Raises KeyError, ValueError
+            without curves
+        """
+        from rigidmd.features.analysis.curve_figure import curve_figure, curves_figure
+
+        if not self.curves:
+            raise ValueError(
+                f"the analysis {self.name} has no curves: {'; '.join(map(str, self.values))}"
+            )
+        if curve or len(self.curves) == 1:
+            return curve_figure(self._curve(curve))
+        return curves_figure(self.curves, self.about)
+
+    def to_dataframe(self, curve: str = "") -> "pandas.DataFrame":
+        """The columns of a curve with their errors, as in its CSV file; of an analysis without
+        curves its values.
+
+        curve : name of one of `curves`. Default: the first. Raises KeyError, ImportError without
+            pandas
+        """
+        try:
+            import pandas
+        except ImportError:
+            raise ImportError("to_dataframe() needs pandas: pip install pandas") from None
+        if self.curves or curve:
+            return pandas.DataFrame(self._curve(curve).table)
+        return pandas.DataFrame(self.values, columns=list(Value._fields))
+
+    def _curve(self, name: str) -> Curve:
+        """The curve of this name. Without a name the first. Raises KeyError with all names."""
+        for curve in self.curves:
+            if name in ("", curve.file):
+                return curve
+        raise KeyError(
+            f"no curve {name!r}; there are {', '.join(curve.file for curve in self.curves)}"
+        )
+
+    def __str__(self) -> str:
+        curves = [f"{', '.join(curve.columns)} against {curve.axis[0]}" for curve in self.curves]
+        lines = [*self.values, *([] if self.values else curves), *self.notes]
+        return "\n".join([f"{self.about}:", *(f"  {line}" for line in lines)])
+
+    __repr__ = __str__
+
+
+def too_short(
+    name: str, unit: str, value: float, error: float | None, why: str, tau: float | None = None
+) -> Value:
+    """No value, because the run is too short: why it is, and the value so far. tau : correlation
+    time (ps)"""
+    so_far = f"{format_with_error(value, error)}{'' if unit in ('', '1') else f' {unit}'}"
+    return Value(name, unit, None, None, tau, f"{why}. So far: {so_far}")
+
+
+def with_error(value: Value) -> Value:
+    """A value that has an error, or else none, because the run is too short."""
+    if value.value is None or (value.error is not None and isfinite(value.error)):
+        return value
+    why = "too short for an error"
+    return too_short(value.name, value.unit, value.value, None, why, value.correlation_ps)
+
+
+def converged_value(
+    name: str,
+    unit: str,
+    value: float,
+    error: float | None,
+    span: float,
+    correlation: float,
+    note: str = "",
+    least: float = MIN_CORRELATION_TIMES,
+) -> Value:
+    """A value from a run of length `span`, which has to be `least` correlation times long (both
+    ps)."""
+    if not correlation > 0 or not isfinite(value):
+        return Value(name, unit, None, None, None, "the frames give no correlation time")
+    if (lengths := span / correlation) < least:
+        why = (
+            f"{span:.3g} ps are {lengths:.2g} correlation times of {correlation:.3g} ps, too short"
+            f" for a value; {least:g} of them are {least * correlation:.3g} ps"
+        )
+        return too_short(name, unit, value, error, why, correlation)
+    return with_error(Value(name, unit, value, error, correlation, note))
+
+
+Array = Callable[[np.ndarray], np.ndarray]
+
+
+def _unchanged(values: np.ndarray) -> np.ndarray:
+    return values
+
+
+def with_block_error(
+    runs: Runs, measure: Callable[[RigidFrames], np.ndarray], conclude: Array = _unchanged
+) -> Measured:
+    """An array computed from frames, and its standard error: for one run from blocks of at least
+    two frames, for several runs from their scatter.
+
+    measure : means over some frames; conclude : function of the means over all of them
+    """
+    if runs.are_several:
+        return runs.estimate([measure(run) for run in runs.members], conclude)
+    frames = runs.first
+    value = np.asarray(conclude(measure(frames)), float)
+    size = len(frames) // BLOCKS
+    blocks = range(len(frames) - size * BLOCKS, len(frames), size) if size > 1 else ()
+    parts = [np.asarray(conclude(measure(frames[k : k + size])), float) for k in blocks]
+    return value, error_of_mean(parts) if parts else np.full_like(value, np.nan)
+
+
+def with_group_error(
+    runs: Runs,
+    kind: Kind,
+    measure: Callable[[RigidFrames, Kind], np.ndarray],
+    conclude: Array = _unchanged,
+) -> Measured:
+    """An array computed from the molecules of a species, and its standard error: for one run the
+    larger of two estimates, from blocks of frames and from groups of molecules; of several runs
+    from their scatter. Blocks are too similar in a gas, groups where molecules move together."""
+    value, error = with_block_error(runs, lambda part: measure(part, kind), conclude)
+    if (count := min(MAX_GROUPS, len(kind.index))) > 1 and not runs.are_several:
+        groups = (
+            kind._replace(index=kind.index[k::count], sites=kind.sites[k::count])
+            for k in range(count)
+        )
+        error = np.fmax(
+            error, error_of_mean([conclude(measure(runs.first, group)) for group in groups])
+        )
+    return value, error
+
+
+def mean_of_series(runs: Runs, series: list[np.ndarray]) -> tuple[float, float | None]:
+    """Mean of a number for each frame, and its standard error.
+
+    series : the numbers (f,) of each run
+    """
+    if runs.are_several:
+        value, error = runs.estimate([values.mean() for values in series], _unchanged)
+        return float(value), float(error)
+    value, error = mean_and_error(series[0])
+    return (float(series[0].mean()) if value is None else value), error
+
+
+def correlation_time_of(runs: Runs, series: list[np.ndarray]) -> float:
+    """Correlation time (ps) of a number for each frame, mean over runs.
+
+    series : the numbers (f,) of each run
+    """
+    pairs = zip(series, runs.members, strict=True)
+    times = [correlation_time(values, run.span / (len(run) - 1)) for values, run in pairs]
+    return float(runs.mean(times))

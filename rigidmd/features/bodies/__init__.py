@@ -1,0 +1,1 @@
+"""A single rigid body: tops, gyroscopes, bodies in a fluid, satellites."""

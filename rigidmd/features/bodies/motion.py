@@ -1,0 +1,227 @@
+"""The motion of a single body: the columns of motion.csv, with the errors of the conserved
+quantities."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.core.state import WORK, State
+from rigidmd.engines.samples import BODY, BODY_COLUMNS, MATRIX, Column, SampleTable
+from rigidmd.features.bodies.forces.applied import (
+    PythonForce,
+    SteadyForce,
+    TimeDependentForce,
+    steady_energies,
+)
+from rigidmd.features.bodies.forces.resistance import NoResistance
+from rigidmd.features.bodies.system import BodySystem
+from rigidmd.mechanics.free_rotor import DrivenRotor
+from rigidmd.mechanics.rotation import to_euler_angles, to_quaternion, unit_vector
+from rigidmd.mechanics.time_functions import is_constant_function
+from rigidmd.mechanics.translation import FluidTranslation, InertialFrame, inertial_masses
+
+
+class Snapshot(NamedTuple):
+    time: float
+    state: State
+
+
+@dataclass(repr=False)
+class Motion(SampleTable):
+    """The samples of a run as columns.
+
+    columns : name -> array (t,) in SI units. `described` explains them. Position, velocity,
+        attitude and omega are relative to the frame. L is the angular momentum relative to
+        non-rotating axes, wheels (h) included, along the axes of the frame (lab) or of the body.
+        The kinetic energy is without that of wheels about their axes.
+    invariants : names of conserved quantities. Column NAME_error is the change since the start, of
+        energies relative to the largest kinetic energy, of L relative to the largest |L|.
+    """
+
+    columns: dict[str, np.ndarray]
+    invariants: list[str]
+
+    def __post_init__(self) -> None:
+        self.described = {name: BODY_COLUMNS[name] for name in self.columns}
+        if BODY["rotation"].names[0] in self.columns:
+            self.described[MATRIX] = Column(
+                "", "1", "the rotation matrices (n, 3, 3): lab = Q body"
+            )
+
+    def _array(self, name: str) -> np.ndarray:
+        """An array (t,) in SI units; of "Q", for a body that rotates, matrices (t, 3, 3)."""
+        if name == MATRIX:
+            return np.stack(
+                [self.columns[name] for name in BODY["rotation"].names], axis=-1
+            ).reshape(-1, 3, 3)
+        return self.columns[name]
+
+
+def motion(system: BodySystem, snapshots: list[Snapshot]) -> Motion:
+    times = np.array([s.time for s in snapshots])
+    parts = [np.array([s.state[k] for s in snapshots]) for k in range(len(State._fields) - 1)]
+    states = State._make([*parts, np.zeros(0)])
+    position, velocity, rotation, omega = system.motion(times, states)
+    columns = {"time": times} | _columns("position", position) | _columns("velocity", velocity)
+    if system.rotates:
+        columns |= _columns("rotation", rotation.reshape(-1, 9))
+        columns |= _columns("quaternion", _continuous(to_quaternion(rotation)))
+        columns |= _columns("euler_angles", to_euler_angles(rotation))
+        if isinstance(system.body.rotor, DrivenRotor):
+            columns |= _columns("h_body", system.moments(times)[1] @ system.axes.T)
+        for name, body in (
+            ("omega", omega),
+            ("L", states.angular_momentum_body.reshape(-1, 3) @ system.axes.T),
+        ):
+            columns |= _columns(f"{name}_body", body)
+            columns |= _columns(f"{name}_lab", np.einsum("tij,tj->ti", rotation, body))
+    columns |= energies(system, times, states)
+    errors = _errors(system, columns)
+    columns |= {f"{name}_error": error for name, error in errors.items()}
+    if system.rotates:
+        columns["orthogonality_error"] = np.abs(
+            np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)
+        ).max(axis=(1, 2))
+    return Motion(columns, list(errors))
+
+
+def _columns(family: str, values: np.ndarray) -> dict[str, np.ndarray]:
+    """The columns of a family from values (t, n)."""
+    return dict(zip(BODY[family].names, values.T, strict=True))
+
+
+def _continuous(quaternions: np.ndarray) -> np.ndarray:
+    """The same rotations, with signs that do not jump from one sample to the next."""
+    overlap = np.sign(np.sum(quaternions[1:] * quaternions[:-1], axis=1))
+    return (
+        quaternions * np.concatenate([[1.0], np.cumprod(np.where(overlap < 0, -1.0, 1.0))])[:, None]
+    )
+
+
+def is_balanced(system: BodySystem) -> bool:
+    """Whether the energy less the work is conserved: in an inertial frame or one that rotates
+    uniformly."""
+    frame = system.body.frame
+    return isinstance(frame, InertialFrame) or is_constant_function(frame.angular_velocity)
+
+
+def energies(system: BodySystem, times: np.ndarray, states: State) -> dict[str, np.ndarray]:
+    """Kinetic energy (less Omega . J in a rotating frame), potential energy, their sum, and work of
+    other forces."""
+    n = len(times)
+    kinetic = np.zeros(n)
+    potential = np.zeros(n)
+    about_origin = np.zeros((n, 3))
+    if system.rotates:
+        rotation = states.rotation.reshape(n, 3, 3)
+        momentum = states.angular_momentum_body.reshape(n, 3)
+        inertia, carried = system.moments(times)
+        twice = np.divide(
+            (momentum - carried) ** 2, inertia, out=np.zeros((n, 3)), where=inertia > 0
+        )
+        kinetic += 0.5 * twice.sum(axis=1)
+        about_origin += np.einsum("tij,tj->ti", rotation, momentum)
+    if system.translates:
+        position = states.position.reshape(n, 3)
+        impulse = system.mass * states.velocity.reshape(n, 3)
+        along = np.einsum("tji,tj->ti", rotation, impulse) if system.rotates else impulse
+        kinetic += 0.5 * (along**2 / inertial_masses(system.body.translation)).sum(axis=1)
+        about_origin += np.cross(position, impulse)
+    kinetic -= (system.frame_rates(times) * about_origin).sum(axis=1)
+    for term in system.terms.values():
+        if isinstance(term, SteadyForce):
+            potential += steady_energies(term, states.position, states.rotation)
+    return {
+        "kinetic": kinetic,
+        "potential": potential,
+        "energy": kinetic + potential,
+        "work": states.energy_ledger.reshape(n, 3)[:, WORK],
+    }
+
+
+def _errors(system: BodySystem, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Relative changes since the start of the quantities that this scene conserves."""
+    body = system.body
+    forces = [term for term in system.terms.values() if isinstance(term, SteadyForce)]
+    driven = any(
+        isinstance(term, TimeDependentForce | PythonForce) for term in system.terms.values()
+    )
+    lossless = isinstance(body.resistance, NoResistance)
+    inertial = isinstance(body.frame, InertialFrame)
+    errors = {}
+    if is_balanced(system):
+        balance = columns["energy"] - columns["work"]
+        errors["energy"] = _relative(
+            balance - balance[0], np.abs(columns["kinetic"]).max() or np.abs(balance[0])
+        )
+    if not system.rotates:
+        return errors
+    momentum = {k: columns[f"L_lab_{k}"] for k in "xyz"}
+    size = np.sqrt(sum(part**2 for part in momentum.values()))
+    arms = [term.point for term in forces if term.force.any()]
+    if lossless and not driven and inertial and not isinstance(body.translation, FluidTranslation):
+        if not any(arm.any() for arm in arms):
+            errors["L_lab"] = _relative(
+                np.sqrt(sum((part - part[0]) ** 2 for part in momentum.values())), size.max()
+            )
+            errors["L_size"] = _relative(size - size[0], size.max())
+        else:
+            pulling = [
+                np.flatnonzero(term.force)
+                for term in forces
+                if term.point.any() and term.force.any()
+            ]
+            if all(len(p) == 1 and p[0] == pulling[0][0] for p in pulling):
+                k = "xyz"[pulling[0][0]]
+                errors[f"L_{k}"] = _relative(momentum[k] - momentum[k][0], size.max())
+    axis = _kept_axis(system, arms, driven=driven)
+    if axis is not None:
+        along = columns[f"L_body_{axis + 1}"]
+        errors[f"L_{axis + 1}"] = _relative(along - along[0], size.max())
+    return errors
+
+
+def _kept_axis(system: BodySystem, arms: list[np.ndarray], *, driven: bool) -> int | None:
+    """The symmetry axis of a body if no torque acts about it, so that L along it is conserved."""
+    body = system.body
+    if (
+        driven
+        or not np.array_equal(system.axes, np.eye(3))
+        or isinstance(body.translation, FluidTranslation)
+    ):
+        return None
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        symmetric = system.inertia[i] == system.inertia[j] and system.inertia[k] > 0
+        on_axis = not any(arm[[i, j]].any() for arm in arms)
+        if isinstance(body.rotor, DrivenRotor):
+            inertia, momentum = body.rotor.inertia, body.rotor.momentum
+            symmetric &= is_constant_function(inertia) and not any(
+                part[:, [i, j]].any() for part in momentum[1:]
+            )
+        if not isinstance(body.resistance, NoResistance):
+            drag = body.resistance
+            symmetric &= not any(
+                x[k] for x in (drag.rotation_dry, drag.rotation_linear, drag.rotation_quadratic)
+            )
+        if symmetric and on_axis:
+            return k
+    return None
+
+
+def _relative(error: np.ndarray, scale: float) -> np.ndarray:
+    return error / scale if scale > 0 else error
+
+
+def drawn_axis(system: BodySystem) -> np.ndarray:
+    """The body axis (3,) whose path is drawn: given in the scene, else to the centre of mass, of
+    symmetry, or 3."""
+    if system.scene.output.axis is not None:
+        return unit_vector(np.array(system.scene.output.axis))
+    if system.centre.any():
+        return unit_vector(system.centre)
+    for k in (2, 0, 1):
+        if system.inertia[k - 1] == system.inertia[k - 2] != system.inertia[k]:
+            return system.axes[:, k]
+    return system.axes[:, 2]

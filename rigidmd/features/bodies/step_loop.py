@@ -1,0 +1,203 @@
+"""The step loop of a single body, and its flows. The types choose each part, so only what a scene
+has is compiled."""
+
+from typing import NamedTuple
+
+from rigidmd.compile import chosen_by_type, implements, is_a, kernel
+from rigidmd.core.integrators import KICK
+from rigidmd.core.state import NOW, OK, ORIGIN, WORK
+from rigidmd.dynamics.flows import ORTHOGONALITY_INTERVAL
+from rigidmd.dynamics.force_gradient import (
+    GradientWorkspace,
+    add_gyration,
+    displace,
+    evaluate,
+    load_of_kick,
+    needs_forces,
+)
+from rigidmd.dynamics.registers import DONE, LOADED
+from rigidmd.features.bodies.forces.resistance import NoResistance, Resistance, kick_with_resistance
+from rigidmd.forces.terms import compute_body_load, total_power, trait
+from rigidmd.mechanics.free_rotor import (
+    DrivenRotor,
+    ExactRotor,
+    NoRotor,
+    SplitRotor,
+    moments,
+    restore_orthogonality,
+    rotate_by_vector,
+)
+from rigidmd.mechanics.translation import (
+    FluidTranslation,
+    FreeTranslation,
+    InertialFrame,
+    NoTranslation,
+    RotatingFrame,
+    body_component,
+    body_vector,
+    frame_rate,
+    inertial_mass,
+    lab_vector,
+    rotate_with_frame,
+    translate,
+)
+
+
+class Body(NamedTuple):
+    """The constant part of a single body, in SI units. The counterpart of `Model` for molecules."""
+
+    translation: FreeTranslation | NoTranslation | FluidTranslation
+    rotor: SplitRotor | ExactRotor | DrivenRotor | NoRotor
+    frame: InertialFrame | RotatingFrame = InertialFrame()
+    resistance: NoResistance | Resistance = NoResistance()
+
+
+@kernel(from_python=True)
+def advance_body(model, state, load, terms, flows, gradient_workspace, dt, until, progress):
+    """Take steps of dt of a body until state.step is `until`. Returns a status code, after which
+    another call continues exactly where this one stopped.
+
+    terms : a tuple of workspaces; flows : see `flows.FlowArrays`; progress : see `registers`
+    gradient_workspace : None compiles no kicks with gradients
+    """
+    while state.step[NOW] < until:
+        while progress[DONE] < len(flows.kind):
+            k = progress[DONE]
+            h = flows.fraction[k] * dt
+            if flows.kind[k] == KICK:
+                tau = 0.0
+                if gradient_workspace is not None:
+                    tau = flows.gradient[k] * dt * dt
+                while needs_forces(progress, gradient_workspace, tau):
+                    known = progress[LOADED] != 0
+                    status = _evaluate(model, state, load, terms, gradient_workspace, tau, known)
+                    if status != OK:
+                        return status
+                    progress[LOADED] = 2 if known else 1
+                pushing = load_of_kick(load, gradient_workspace, tau)
+                accumulate_work(model, terms, state, 0.5 * h)
+                kick_with_resistance(
+                    model.resistance,
+                    model.translation,
+                    model.rotor,
+                    model.frame,
+                    state,
+                    pushing,
+                    h,
+                )
+                accumulate_work(model, terms, state, 0.5 * h)
+            else:
+                time = state.time[NOW]
+                translate(model.translation, model.rotor, state, time, h)
+                rotate_with_frame(model.frame, state, time, h)
+                state.time[NOW] = (
+                    state.time[ORIGIN]
+                    + (state.step[NOW] - state.step[ORIGIN] + flows.moment[k]) * dt
+                )
+                progress[LOADED] = 0
+                if k == flows.last and (state.step[NOW] + 1) % ORTHOGONALITY_INTERVAL == 0:
+                    restore_orthogonality(state.rotation, state.angular_momentum_body)
+            progress[DONE] += 1
+        progress[DONE] = 0
+        state.step[NOW] += 1
+    return OK
+
+
+@chosen_by_type
+def _evaluate(model, state, load, terms, gradient_workspace, tau, known):
+    """`evaluate`, of which a scheme without gradients compiles the forces only. A status code."""
+    if not is_a(gradient_workspace, GradientWorkspace):
+        return lambda model, state, load, terms, gradient_workspace, tau, known: compute_body_load(
+            terms, state, load
+        )
+    return lambda model, state, load, terms, gradient_workspace, tau, known: evaluate(
+        model, state, load, terms, gradient_workspace, tau, known
+    )
+
+
+@implements(displace, Body, inline=True)
+def _displace_body(model, state, load, tau):
+    for k in range(len(load.force)):
+        for i in range(3):
+            state.position[k, i] += tau / model.translation.mass * load.force[k, i]
+    for k in range(len(load.torque_body)):
+        n, t = load.torque_body[k], state.time[NOW]
+        i0, i1, i2 = (
+            moments(model.rotor, t, 0)[0],
+            moments(model.rotor, t, 1)[0],
+            moments(model.rotor, t, 2)[0],
+        )
+        rotate_by_vector(state.rotation[k], tau * i0 * n[0], tau * i1 * n[1], tau * i2 * n[2])
+
+
+@implements(add_gyration, Body, inline=True)
+def _add_gyration_of_body(model, load, tau, gain):
+    for b in range(len(load.torque_body)):
+        n = load.torque_body[b]
+        i0, i1, i2 = (
+            moments(model.rotor, 0.0, 0)[0],
+            moments(model.rotor, 0.0, 1)[0],
+            moments(model.rotor, 0.0, 2)[0],
+        )
+        gain.torque_body[b, 0] += tau * (i1 - i2) * n[1] * n[2]
+        gain.torque_body[b, 1] += tau * (i2 - i0) * n[2] * n[0]
+        gain.torque_body[b, 2] += tau * (i0 - i1) * n[0] * n[1]
+
+
+@chosen_by_type(inline=True)
+def accumulate_work(model, terms, state, h):
+    """Add the work of time-dependent terms over h to the energy ledger, half before a kick and half
+    after it: their power at the current velocity."""
+    if not any(trait(term.instance_class, "time_dependent") for term in terms.types):
+        return lambda model, terms, state, h: None
+
+    def accumulate_work_of_body(model, terms, state, h):
+        velocity, omega = relative_motion(model, state)
+        state.energy_ledger[WORK] += h * total_power(terms, state, velocity, omega)
+
+    return accumulate_work_of_body
+
+
+@kernel
+def relative_motion(model, state):
+    """(velocity along lab axes, omega along body axes) relative to the frame, as tuples, 0 where
+    the body has none."""
+    W = frame_rate(model.frame, state.time[NOW])
+    velocity = omega = (0.0, 0.0, 0.0)
+    if len(state.position):
+        V = state.velocity[0]
+        velocity = (V[0], V[1], V[2])
+        if len(state.rotation):
+            q = state.rotation[0]
+            a = (
+                body_component(q, V, 0)
+                * model.translation.mass
+                / inertial_mass(model.translation, 0)
+            )
+            b = (
+                body_component(q, V, 1)
+                * model.translation.mass
+                / inertial_mass(model.translation, 1)
+            )
+            c = (
+                body_component(q, V, 2)
+                * model.translation.mass
+                / inertial_mass(model.translation, 2)
+            )
+            velocity = lab_vector(q, a, b, c)
+        x = state.position[0]
+        u, v, w = velocity
+        velocity = (
+            u - W[1] * x[2] + W[2] * x[1],
+            v - W[2] * x[0] + W[0] * x[2],
+            w - W[0] * x[1] + W[1] * x[0],
+        )
+    if len(state.rotation):
+        q = state.rotation[0]
+        L = state.angular_momentum_body[0]
+        i0, h0 = moments(model.rotor, state.time[NOW], 0)
+        i1, h1 = moments(model.rotor, state.time[NOW], 1)
+        i2, h2 = moments(model.rotor, state.time[NOW], 2)
+        drag = body_vector(q, W)
+        omega = ((L[0] - h0) * i0 - drag[0], (L[1] - h1) * i1 - drag[1], (L[2] - h2) * i2 - drag[2])
+    return velocity, omega

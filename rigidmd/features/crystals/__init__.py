@@ -1,0 +1,1 @@
+"""Crystals: CIF and symmetry, and the formats that liquids do not need."""

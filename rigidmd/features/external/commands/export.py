@@ -1,0 +1,34 @@
+"""`rigidmd export`."""
+
+import shlex
+from pathlib import Path
+
+from rigidmd.commands.arguments import SCENE, Options, command, output_folder, read_scene
+from rigidmd.features.external.programs import programs
+
+
+@command(
+    80,
+    "write a scene as a folder that runs on another engine by itself",
+    "rigidmd export water_pme.toml --to lammps -o water_lammps",
+    *SCENE,
+    lambda parser: parser.add_argument(
+        "--to",
+        required=True,
+        choices=[name for name, of in programs().items() if of.writer],
+        help="the engine",
+    ),
+    *output_folder("NAME-ENGINE", "an earlier export"),
+    writes=True,
+)
+def _export(options: Options) -> int:
+    from rigidmd.features.external.verify import export
+
+    scene = read_scene(options)
+    folder = Path(options.output or f"{scene.name}-{options.to}")
+    done = export(scene, options.to, folder, options.force)
+    print(f"{scene.name} for {done.title} in {folder}: {', '.join(done.files)}")
+    for note in done.notes:
+        print(f"  {note}")
+    print(f"next:\n  cd {shlex.quote(str(folder))} && {done.command}")
+    return 0

@@ -1,0 +1,11 @@
+"""GROMACS for commands, which do not load its export."""
+
+from rigidmd.features.external.programs import Program
+
+PROGRAM = Program(
+    "GROMACS",
+    "GROMACS has its own package",
+    "files:TRANSLATIONS",
+    writer="files:write_gromacs",
+    command="sh run.sh",
+)

@@ -1,0 +1,1 @@
+"""Free energies: coupling, insertion, mean force and virial coefficients."""

@@ -1,0 +1,1 @@
+"""Hybrid Monte Carlo: trajectories that are accepted or rejected."""

@@ -1,0 +1,1 @@
+"""Potentials of users, between sites and between bodies: formula, table and Python function."""

@@ -1,0 +1,200 @@
+"""Slopes of a traced function, and its code.
+
+Slopes follow from the graph by reverse differentiation, as further nodes. `code_of` writes nodes as
+lines of Python, which are compiled.
+"""
+
+from collections.abc import Callable, Container, Mapping, Sequence
+
+import numpy as np
+
+from rigidmd.features.potentials.poses.trace import Number, Traced, computed, where
+
+#: Kind of a node -> its code.
+_CODE = {
+    "add": "({} + {})",
+    "subtract": "({} - {})",
+    "multiply": "({} * {})",
+    "divide": "({} / {})",
+    "negative": "(-{})",
+    "less": "({} < {})",
+    "where": "({1} if {0} else {2})",
+}
+#: Kind of a node -> its values in NumPy.
+_ARRAYS: dict[str, Callable] = {
+    "add": np.add,
+    "subtract": np.subtract,
+    "multiply": np.multiply,
+    "divide": np.divide,
+    "negative": np.negative,
+    "sqrt": np.sqrt,
+    "exp": np.exp,
+    "log": np.log,
+    "sin": np.sin,
+    "cos": np.cos,
+    "tanh": np.tanh,
+    "acos": np.arccos,
+    "fabs": np.fabs,
+    "power": np.power,
+    "less": np.less,
+    "where": np.where,
+}
+#: Kind of a node -> its slopes by its parts: a function of the node and of the parts.
+_SLOPES: dict[str, Callable] = {
+    "add": lambda node, x, y: (1.0, 1.0),
+    "subtract": lambda node, x, y: (1.0, -1.0),
+    "multiply": lambda node, x, y: (y, x),
+    "divide": lambda node, x, y: (1 / y, -node / y),
+    "negative": lambda node, x: (-1.0,),
+    "sqrt": lambda node, x: (0.5 / node,),
+    "exp": lambda node, x: (node,),
+    "log": lambda node, x: (1 / x,),
+    "sin": lambda node, x: (x.cos(),),
+    "cos": lambda node, x: (-x.sin(),),
+    "tanh": lambda node, x: (1 - node * node,),
+    "acos": lambda node, x: (-1 / (1 - x * x).sqrt(),),
+    "fabs": lambda node, x: (where(x < 0.0, -1.0, 1.0),),
+    "power": lambda node, x: (node.parts[1] * x ** (node.parts[1] - 1),),
+    "less": lambda node, x, y: (0.0, 0.0),
+}
+
+
+def slopes_of(output: Traced, leaves: Sequence[Traced]) -> list[Number]:
+    """The slopes of a node by leaves; 0.0 by one on which it does not depend."""
+    slope: dict[int, Number] = {output.index: 1.0}
+    for node in reversed(_in_order([output])):
+        above = slope.get(node.index, 0.0)
+        if not node.inner or (isinstance(above, float) and above == 0):
+            continue
+        if node.kind == "where":
+            condition, yes, no = node.parts
+            terms = [(yes, where(condition, above, 0.0)), (no, where(condition, 0.0, above))]
+        else:
+            factors = _SLOPES[node.kind](node, *node.inner)
+            terms = [
+                (part, above * factor) for part, factor in zip(node.inner, factors, strict=True)
+            ]
+        for part, term in terms:
+            slope[part.index] = slope.get(part.index, 0.0) + term
+    return [slope.get(leaf.index, 0.0) for leaf in leaves]
+
+
+def _in_order(outputs: Sequence[Traced], known: Container[int] = ()) -> list[Traced]:
+    """The nodes that the outputs need, each after those that it needs; not what only known nodes
+    need."""
+    needed: dict[int, Traced] = {}
+    waiting = list(outputs)
+    while waiting:
+        node = waiting.pop()
+        if node.index not in needed:
+            needed[node.index] = node
+            waiting += [] if node.index in known else node.inner
+    return [needed[index] for index in sorted(needed)]
+
+
+def code_of(
+    outputs: Sequence[Number], known: dict[int, str] | None = None
+) -> tuple[list[str], list[str]]:
+    """Lines that compute the nodes, and the text of each output, a node or a number.
+
+    known : text of the nodes that are not computed here
+    """
+    nodes = [output for output in outputs if isinstance(output, Traced)]
+    names: dict[int, str] = dict(known or {})
+    lines: list[str] = []
+    for node in _in_order(nodes, names):
+        if node.index in names:
+            continue
+        if node.kind == "leaf":
+            names[node.index] = node.parts[0]
+        elif node.kind == "constant":
+            names[node.index] = repr(node.parts[0])
+        else:
+            names[node.index] = f"v{node.index}"
+            lines.append(f"v{node.index} = {_expression(node, names)}")
+    texts = [
+        names[output.index] if isinstance(output, Traced) else repr(float(output))
+        for output in outputs
+    ]
+    return lines, texts
+
+
+def values_of(
+    outputs: Sequence[Number], leaves: Mapping[str, np.ndarray], known: Mapping[int, float]
+) -> list[np.ndarray]:
+    """The outputs at the values (m,) of leaves, as compiled code computes them: NaN and inf where
+    they are not finite.
+
+    known : values of nodes that are not computed here, by their indices
+    """
+    values: dict[int, np.ndarray | float] = dict(known)
+    with np.errstate(all="ignore"):
+        for node in _in_order([x for x in outputs if isinstance(x, Traced)], known):
+            if node.index in values:
+                continue
+            if node.kind == "leaf":
+                values[node.index] = leaves[node.parts[0]]
+            elif node.number is not None:
+                values[node.index] = node.number
+            else:
+                parts = [values[x.index] if isinstance(x, Traced) else x for x in node.parts]
+                values[node.index] = _ARRAYS[node.kind](*parts)
+    count = len(next(iter(leaves.values())))
+    return [
+        np.broadcast_to(values[x.index] if isinstance(x, Traced) else x, count) for x in outputs
+    ]
+
+
+def _expression(node: Traced, names: dict[int, str]) -> str:
+    parts = [names[part.index] for part in node.inner]
+    if node.kind == "power":
+        exponent = node.parts[1]
+        if exponent == round(exponent) and abs(exponent) <= 64:
+            whole = f"{parts[0]} ** {int(abs(exponent))}"
+            # a negative power of 0 would raise ZeroDivisionError in compiled code
+            return whole if exponent > 0 else f"1.0 / {whole}"
+        return f"pow({parts[0]}, {exponent!r})"
+    if node.kind in _CODE:
+        return _CODE[node.kind].format(*parts)
+    return f"{node.kind}({', '.join(parts)})"
+
+
+class Hoisted:
+    """What depends on parameters alone is computed once for each pair of kinds: it is read from a
+    row of numbers in the loop.
+
+    names : of the parameters, which are leaves
+    """
+
+    def __init__(self, outputs: Sequence[Number], names: Sequence[str]):
+        nodes = _in_order([output for output in outputs if isinstance(output, Traced)])
+        fixed: set[int] = set()
+        for node in nodes:
+            if node.kind == "leaf":
+                is_fixed = node.parts[0] in names
+            else:
+                is_fixed = all(part.index in fixed for part in node.inner)
+            if is_fixed:
+                fixed.add(node.index)
+        used = [part for node in nodes if node.index not in fixed for part in node.inner]
+        used += [output for output in outputs if isinstance(output, Traced)]
+        read = {
+            node.index: node for node in used if node.index in fixed and node.kind != "constant"
+        }
+        self._nodes = list(read.values())
+        self.places = {node.index: k for k, node in enumerate(self._nodes)}
+
+    def values(self, parameters: dict[str, float]) -> list[float]:
+        """The numbers of a pair of kinds, from its parameters by name. Raises TraceError."""
+        known: dict[int, float] = {}
+        for node in _in_order(self._nodes):
+            if node.kind == "leaf":
+                known[node.index] = parameters[node.parts[0]]
+            elif node.number is not None:
+                known[node.index] = node.number
+            else:
+                parts = [
+                    known[part.index] if isinstance(part, Traced) else part for part in node.parts
+                ]
+                known[node.index] = computed(node.kind, parts)
+        return [known[node.index] for node in self._nodes]

@@ -1,0 +1,1 @@
+"""Pair potentials between sites: formulas, tables and functions."""

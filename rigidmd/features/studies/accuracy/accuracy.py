@@ -1,0 +1,470 @@
+"""`rigidmd accuracy`: the errors and run times of integrators at several time steps, from the start
+of a scene. As a table, recommendations, accuracy.csv, .png and a self-contained page."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from rigidmd.core.integrators import RADAU, SCHEMES, SOLVERS
+from rigidmd.errors import SceneError, option
+from rigidmd.features.studies.accuracy.averages import (
+    check_engine_is_rigidmd,
+    check_number_of_steps,
+    check_times,
+    start_of_last_stage,
+)
+from rigidmd.features.studies.accuracy.measurement import IntegratorAccuracy, measure, plan
+from rigidmd.features.studies.accuracy.orders import FLOOR_MARK, order_table, with_marks
+from rigidmd.features.view.figures.style import (
+    FAINT,
+    INK,
+    curve_style,
+    label_minor_ticks,
+    new_figure,
+    open_axis,
+    write_figure,
+)
+from rigidmd.features.view.page import chips, code, items, section, table, wide, write_page
+from rigidmd.io.write import Column, Table, columns_text
+from rigidmd.run.force_errors import single_precision_errors
+from rigidmd.run.trial_systems import (
+    COMPARATORS,
+    SPAN_PS,
+    body_trial_system,
+    molecular_trial_system,
+)
+from rigidmd.run.trials import Trial
+from rigidmd.scene import BodyScene, MolecularScene
+from rigidmd.scene.validation import did_you_mean
+
+#: Default integrators: velocity Verlet, the best of each kind, those of [[integrators]]; for a body
+#: also solvers.
+DEFAULT_INTEGRATORS = (
+    *(name for name, scheme in SCHEMES.items() if scheme.is_default),
+    *(name for name, (solver, _) in COMPARATORS.items() if solver != RADAU),
+)
+#: Time steps per force evaluation, relative to the scene's; longer ones follow until one fails.
+LADDER = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125)
+RADIANS = 0.1  # rotation of a spinning body per force evaluation in the middle of the ladder, rad
+#: step of a body that does not rotate, in the step of its scene, which is assumed to be suitable
+AT_REST = 8.0
+AT_A_POLE = "the start has theta = 0 or 180 degrees, where Euler angles are singular"
+
+
+def measure_accuracy(
+    scene: MolecularScene | BodyScene,
+    integrators: list[str] | None = None,
+    timesteps: list[float] | None = None,
+    span: float | None = None,
+    repeats: int = 3,
+    progress: Callable[[float], object] = lambda fraction: None,
+) -> IntegratorAccuracy:
+    """Error against run time of integrators at time steps, on the start of a scene. Raises
+    SceneError.
+
+    integrators : names. Default: the scene's and those that suit it. The others are in `left_out`.
+        rk4, dop853 and radau use the scene's formulation, or matrix. A suffix _matrix, _quaternion
+        or _euler_angles sets another
+    timesteps : fs for molecules, s for a body, the same for all. Default: steps of equal cost
+        around the scene's
+    span : ps or s
+    progress : called with the fraction that is done. At 0, after all arguments have been checked
+
+    Molecules start where the last stage starts, after the earlier stages have run. No thermostat
+    acts.
+    """
+    check_engine_is_rigidmd(scene)
+    known = (*scene.schemes, *COMPARATORS)
+    integrators = list(dict.fromkeys(_method_name(name, scene) for name in integrators or []))
+    if unknown := [name for name in integrators if name not in known]:
+        of_all = f"(known: {', '.join(known)})"
+        errors = [
+            f"unknown integrator {name}{did_you_mean(name, known)} {of_all}" for name in unknown
+        ]
+        raise SceneError(option("integrators"), errors)
+    lengths = [*(timesteps or []), *([] if span is None else [span])]
+    check_times(scene, lengths, f"time steps and {option('span')}")
+    if repeats < 1:
+        raise SceneError("accuracy", [f"{option('repeats')} must be at least 1"])
+    if isinstance(scene, MolecularScene) and (
+        refused := [name for name in integrators if name in COMPARATORS]
+    ):
+        reasons = [f"{name} does not suit this scene: it is for single bodies" for name in refused]
+        raise SceneError(scene.source, reasons)
+    progress(0.0)
+    is_body = isinstance(scene, BodyScene)
+    if is_body:
+        trial_system, speed = body_trial_system(scene, span)
+        evaluations = scene.run.row.force_evaluations if scene.run.has_scheme else 1
+        base = RADIANS / speed if speed else AT_REST * scene.run.timestep_s / evaluations
+    else:
+        last = scene.stages[-1]
+        if last.is_minimisation:
+            what = "the last stage is a minimisation: accuracy needs another stage at the end"
+            raise SceneError(scene.source, [what])
+        simulation, state = start_of_last_stage(scene)
+        trial_system = molecular_trial_system(simulation.system, state, last.rotor, span or SPAN_PS)
+        trial_system.rounding = single_precision_errors(simulation.system, state)
+        evaluations = last.row.force_evaluations if last.has_scheme else 1
+        base = simulation.scene.stages[-1].step_fs / evaluations
+    if refused := [name for name in integrators if name not in trial_system.methods]:
+        reasons = [
+            f"{name} does not suit this scene: {trial_system.refused[name]}" for name in refused
+        ]
+        raise SceneError(scene.source, reasons)
+    left_out = {}
+    if not integrators:
+        defaults = [name for name in DEFAULT_INTEGRATORS if is_body or name in SCHEMES]
+        defaults += [row.name for row in scene.integrators]
+        left_out = {name: why for name, why in trial_system.refused.items() if name in defaults}
+        left_out |= {name: AT_A_POLE for name in trial_system.singular if name in defaults}
+        of_scene = _method_name(
+            scene.run.integrator if is_body else scene.stages[-1].integrator, scene
+        )
+        candidates = dict.fromkeys((*defaults, of_scene))
+        integrators = [
+            name for name in candidates if name in trial_system.methods and name not in left_out
+        ]
+    steps = {
+        name: (
+            timesteps
+            or [base * rung * trial_system.methods[name].force_evaluations for rung in LADDER]
+        )
+        for name in integrators
+    }
+    for step in [step for of_method in steps.values() for step in of_method]:
+        check_number_of_steps(trial_system.span, step * trial_system.time_size)
+    measured = measure(
+        trial_system, plan(trial_system, steps), repeats, progress=progress, extend=not timesteps
+    )
+    measured.left_out = left_out
+    return measured
+
+
+def _method_name(name: str, scene: MolecularScene | BodyScene) -> str:
+    """The full name of a method: for solvers with the formulation of the scene, unless it is the
+    matrix."""
+    solver, _, form = name.partition("_")
+    if solver in SOLVERS and isinstance(scene, BodyScene):
+        form = form or scene.run.formulation
+        return solver if form in (None, "matrix") else f"{solver}_{form}"
+    return name
+
+
+FILES = ("accuracy.csv", "accuracy.png", "accuracy.html")
+LABEL = (0.14, 0.045)  # width and height of the label of a step, as fractions of an axis
+DOUBTFUL = 0.2  # spread of repeated timings that causes a warning
+
+
+def trial_table(measured: IntegratorAccuracy) -> Table:
+    """A row for each trial: its cost, the errors of Q, X, and of all conserved quantities."""
+    s = measured.trial_system
+    per = "ps" if s.time_unit == "fs" else "s"
+
+    def column(header: str, value: Callable[[Trial], float | None], short: str = "") -> Column:
+        def known(trial: Trial) -> float | None:
+            x = None if trial.diverged else value(trial)
+            return None if x is None or np.isnan(x) else x
+
+        return Column(header, known, short)
+
+    others = dict.fromkeys(name for trial in measured.trials for name in trial.conserved_errors)
+    return Table(
+        [
+            Column("integrator", lambda t: t.integrator),
+            Column(f"step ({s.time_unit})", lambda t: t.timestep),
+            Column(f"forces per {per}", lambda t: t.forces / s.span, f"forces/{per}"),
+            Column(
+                f"seconds per {per}",
+                lambda t: "fails" if t.diverged else t.time / s.span,
+                f"s/{per}",
+            ),
+            column("spread (%)", lambda t: t.spread and 100 * t.spread, "± %"),
+            column("error of Q", lambda t: t.rotation_error, "Q"),
+            column(
+                f"error of X ({s.length_unit})", lambda t: t.position_error, f"X ({s.length_unit})"
+            ),
+            column("energy rms", lambda t: t.energy_rms, "energy"),
+            column("energy drift in the span", lambda t: t.energy_drift, "drift"),
+            column("±", lambda t: t.energy_drift_error),
+            *(
+                column(f"error of {name}", lambda t, name=name: t.conserved_errors.get(name), name)
+                for name in others
+            ),
+            column("orthogonality error", lambda t: t.orthogonality_error, "QᵀQ"),
+        ],
+        measured.trials,
+    )
+
+
+def table_text(measured: IntegratorAccuracy) -> str:
+    text = "errors of Q, X, the energy (rms, drift over the span) and other conserved quantities\n"
+    return text + trial_table(measured).text()
+
+
+def describe_accuracy(measured: IntegratorAccuracy, *, verbose: bool = False) -> list[str]:
+    """The answer first: the fastest integrator for each error, measured orders, all trials, and
+    remarks."""
+    fastest = [("target error", "fastest integrator", f"compared with {COMMON}")]
+    for error, best, faster, _ in cheapest(measured):
+        gain, _, _ = faster.partition(f" than {COMMON}")
+        fastest.append((error.removeprefix("an "), best, gain))
+    marked = with_marks(measured, trial_table(measured))
+    lines = [f"{measured.trial_system.name}, {_span(measured)}", ""]
+    if len(fastest) > 1:
+        lines += [columns_text(fastest, left=(0, 1, 2)), ""]
+    lines += [order_table(measured).text(), "", marked.text()]
+    lines.append(f"{FLOOR_MARK} at the floor: a shorter step does not reduce this error")
+    if verbose:
+        return [*lines, "", *recommendations(measured)]
+    return [*lines, "", *remarks(measured)]
+
+
+def recommendations(measured: IntegratorAccuracy) -> list[str]:
+    """Sentences on the cheapest integrator for each accuracy, and `remarks`."""
+    s = measured.trial_system
+    lines = []
+    for error, best, faster, rivals in cheapest(measured):
+        faster = f": {faster}" if faster else ""
+        rivals = f". Equally fast within timing noise: {rivals}" if rivals else ""
+        lines.append(f"for {error} over {_span(measured)} the fastest is {best}{faster}{rivals}")
+    if lines and s.time_unit == "fs":
+        lines.append(
+            "energy errors grow over longer runs, by a random walk where forces are truncated:"
+            f" --span measures them over more than {s.span:g} ps"
+        )
+    return [*lines, *remarks(measured)]
+
+
+def _span(measured: IntegratorAccuracy) -> str:
+    return (
+        f"{measured.trial_system.span:g} {'ps' if measured.trial_system.time_unit == 'fs' else 's'}"
+    )
+
+
+def remarks(measured: IntegratorAccuracy) -> list[str]:
+    """Sentences on the reference, the longest stable steps, what failed or was omitted, and the
+    timings."""
+    s = measured.trial_system
+    lines = [
+        f"unit of energy errors: {s.energy_unit}{s.energy_note}",
+        (
+            f"reference: {s.reference} in {measured.reference_steps} steps, error about"
+            f" {measured.reference_error:.0e}"
+        ),
+    ]
+    if s.rounding is not None:
+        force, torque = s.rounding
+        torques = f", torques by {torque:.1e}" if torque else ""
+        which = "the reference is in mixed precision too"
+        if s.chooses_precision:
+            which = (
+                "trials with long steps have it, others and the reference are in double precision"
+            )
+        lines.append(
+            f"mixed precision: forces differ from double ones by {force:.1e} of their rms{torques};"
+            f" {which}"
+        )
+    for name in dict.fromkeys(t.integrator for t in measured.trials):
+        failures = [t.failure for t in measured.trials if t.integrator == name and t.failure]
+        if "diverges" in failures:
+            step = measured.stable_step(name)
+            lines.append(
+                f"{name} diverges"
+                + (f" beyond {step:.3g} {s.time_unit}" if step else " at every step tried")
+            )
+        lines += [
+            f"{name}: {failure}" for failure in dict.fromkeys(failures) if failure != "diverges"
+        ][:1]
+    for why in dict.fromkeys(measured.left_out.values()):
+        names = ", ".join(name for name, reason in measured.left_out.items() if reason == why)
+        lines.append(f"omitted: {names}: {why}")
+    return lines + _describe_timings(measured)
+
+
+def _describe_timings(measured: IntegratorAccuracy) -> list[str]:
+    timed = [trial for trial in measured.trials if not trial.diverged]
+    if timed and timed[0].spread is None:
+        return ["timed once: the spread of the seconds is unknown; see --repeats"]
+    doubtful = [
+        (spread, trial)
+        for trial in timed
+        if (spread := trial.spread) is not None and spread > DOUBTFUL
+    ]
+    if not doubtful:
+        return []
+    spread, worst = max(doubtful, key=lambda pair: pair[0])
+    which = f"{worst.integrator} at {worst.timestep:.3g} {measured.trial_system.time_unit}"
+    return [
+        f"warning: repeated timings of {len(doubtful)} of {len(timed)} trials differ by more than"
+        f" {DOUBTFUL:.0%}, those of {which} by {spread:.0%} (± % in the table): was another program"
+        " running? An idle machine or more --repeats help"
+    ]
+
+
+COMMON = "velocity_verlet"  # integrator to compare with
+
+
+def cheapest(measured: IntegratorAccuracy) -> list[tuple[str, str, str, str]]:
+    """For each error of the energy, and of Q or X: the cheapest integrator, how much faster than
+    `COMMON` it is, others that are as fast. Errors with the same answer are one row."""
+    s = measured.trial_system
+    rows = []
+    unit = measured.trial_system.time_unit
+    rotates = any(not np.isnan(t.rotation_error) for t in measured.trials)
+    # A motion of a body with the right energy is not advised if QᵀQ or another invariant is worse.
+    energy = "energy_rms" if s.time_unit == "fs" else "conservation_error"
+    kinds = {
+        energy: ("an energy error", s.energy_unit),
+        "trajectory_error": ("an error of Q", "") if rotates else ("an error of X", s.length_unit),
+    }
+    for error, (what, of) in kinds.items():
+        worst = max((getattr(t, error) for t in measured.trials if not t.diverged), default=0.0)
+        answers: dict[tuple[str, str, str], list[float]] = {}  # -> the targets that have it
+        for target in 10.0 ** np.arange(0, -15, -2):
+            names = dict.fromkeys(t.integrator for t in measured.trials)
+            reached = {name: at for name in names if (at := measured.time_for(name, error, target))}
+            blind = error == "trajectory_error" and target < 3 * measured.reference_error
+            if target > worst or len(reached) < 2 or blind:
+                continue
+            best = min(reached, key=lambda name: reached[name].seconds)
+            at, common = reached.pop(best), reached.get(COMMON)
+            slow = at.seconds * (1 + at.spread / 2)
+            rivals = {
+                name: r.step for name, r in reached.items() if r.seconds * (1 - r.spread / 2) < slow
+            }
+            chosen = f"{best} at {at.step:.2g} {unit}{f' ({at.limit})' if at.limit else ''}"
+            faster = ""
+            if common and COMMON not in rivals:
+                faster = (
+                    f"{common.seconds / at.seconds:.1f} times faster than {COMMON} at"
+                    f" {common.step:.2g} {unit}"
+                )
+            others = ", ".join(f"{name} at {step:.2g} {unit}" for name, step in rivals.items())
+            answers.setdefault((chosen, faster, others), []).append(target)
+        for answer, targets in answers.items():
+            span = " to ".join(
+                f"{target:.0e}" for target in dict.fromkeys((targets[0], targets[-1]))
+            )
+            rows.append((f"{what} of {span} {of}".rstrip(), *answer))
+    return rows
+
+
+def write_accuracy(folder: Path, measured: IntegratorAccuracy, command: str) -> list[Path]:
+    trial_table(measured).write(folder / FILES[0])
+    title = f"{measured.trial_system.name}: error against run time"
+    write_figure(folder / FILES[1], lambda: accuracy_figure(measured), title)
+    write_page(folder / FILES[2], title, _page_parts(measured, command))
+    return [folder / name for name in FILES if (folder / name).is_file()]
+
+
+def _label_steps(axis, points: list[tuple[float, float, float]], unit: str) -> None:
+    """Label points (time, error, step) in this order, each that is far enough from those labelled
+    before."""
+    left, right = axis.get_xlim()
+    left *= (left / right) ** LABEL[0]  # space for the label of the first point
+    axis.set_xlim(left, right)
+    low, high = axis.get_ylim()
+    size = np.array([np.log(right / left), np.log(high / low)])
+    labelled = np.empty((0, 2))
+    for time, error, step in points:
+        at = np.log([time, error]) / size
+        if (np.abs(at - labelled) > LABEL).any(axis=1).all():
+            axis.annotate(
+                f"{step:.2g} {unit}",
+                (time, error),
+                xytext=(-6, -6),
+                textcoords="offset points",
+                fontsize=7,
+                color=INK,
+                ha="right",
+                va="top",
+            )
+            labelled = np.vstack([labelled, at])
+
+
+def accuracy_figure(measured: IntegratorAccuracy):
+    """Log error against log run time, a curve for each integrator. Rings mark the best trials, bars
+    the time spread."""
+    s = measured.trial_system
+    per = "ps" if s.time_unit == "fs" else "s"
+    figure = new_figure(10, 4.8)
+    left, right = figure.subplots(1, 2)
+    rotates = any(not np.isnan(t.rotation_error) for t in measured.trials)
+    titles = {
+        "trajectory_error": (
+            f"error of {'Q' if rotates else f'X ({s.length_unit})'} after {s.span:g} {per}"
+        ),
+        "energy_rms": f"rms error of the energy, {s.energy_unit}",
+    }
+    names = list(dict.fromkeys(t.integrator for t in measured.trials))
+    for axis, (error, title) in zip((left, right), titles.items(), strict=True):
+        for k, name in enumerate(names):
+            trials = [
+                t
+                for t in measured.trials
+                if t.integrator == name and not t.diverged and getattr(t, error) > 0
+            ]
+            times = [t.time / s.span for t in trials]
+            errors = [getattr(t, error) for t in trials]
+            style = curve_style(k)
+            axis.loglog(times, errors, ms=3.5, lw=1.2, label=name, **style)
+            low, high = (
+                [abs(end(t.seconds) - t.time) / s.span for t in trials] for end in (min, max)
+            )
+            axis.errorbar(
+                times, errors, xerr=[low, high], fmt="none", ecolor=style["color"], elinewidth=0.7
+            )
+        front = [t for t in measured.front(error) if getattr(t, error) > 0]
+        points = [(t.time / s.span, getattr(t, error), t.timestep) for t in front]
+        axis.loglog(
+            [time for time, *_ in points],
+            [error for _, error, _ in points],
+            "o",
+            ms=9,
+            mfc="none",
+            mec=INK,
+            mew=0.8,
+            label="best, with its step",
+        )
+        _label_steps(axis, points, s.time_unit)
+        axis.set_title(title, loc="left", fontsize=9, color=INK)
+        open_axis(axis, which="both")
+        label_minor_ticks(axis.xaxis)
+        label_minor_ticks(axis.yaxis)
+    figure.supxlabel(f"computing time (s) per {per} of motion", color=INK, fontsize=10)
+    left.axhline(measured.reference_error, color=FAINT, lw=0.8, ls=":")
+    left.annotate(
+        "error of the reference",
+        (0.01, measured.reference_error),
+        xycoords=("axes fraction", "data"),
+        fontsize=8,
+        color=FAINT,
+        va="bottom",
+    )
+    right.legend(
+        frameon=False,
+        fontsize=8,
+        handlelength=2.8,
+        loc="center left",
+        bbox_to_anchor=(1.0, 0.5),
+        labelcolor=INK,
+    )
+    return figure
+
+
+def _page_parts(measured: IntegratorAccuracy, command: str) -> Iterator[str]:
+    colored = chips(dict.fromkeys(t.integrator for t in measured.trials))
+    titles = [
+        f"error over {_span(measured)}",
+        "least run time",
+        "gain",
+        "equally fast within timing noise",
+    ]
+    advice = table(titles, cheapest(measured), words=True)
+    drawn = wide(accuracy_figure(measured), "accuracy", "log error over log run time")
+    yield section("Recommendations", advice, items(remarks(measured)))
+    yield section("Error against run time", drawn)
+    yield section("All trials", table(*trial_table(measured).shown(), marked=colored))
+    yield section("How to repeat it", code(command))

@@ -1,0 +1,364 @@
+"""Averages of a sweep over a time step, extrapolated to zero time step: extrapolation.csv, .png and
+.html."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from rigidmd.core.statistics import format_signed
+from rigidmd.core.toml import Json
+from rigidmd.engines.samples import COLUMNS
+from rigidmd.errors import RigidMDError, SceneError
+from rigidmd.features.analysis.files import read_table
+from rigidmd.features.studies.extrapolation import (
+    BiasFit,
+    MeanAtStep,
+    Together,
+    extrapolate,
+    means_of_runs,
+)
+from rigidmd.features.studies.joint_fit import RunResults, fit_jointly, results_of_run
+from rigidmd.features.studies.sweep.figure import draw_table
+from rigidmd.features.studies.sweep.folder import Manifest, describe_values, point_name, short_keys
+from rigidmd.features.studies.sweep.table import (
+    DRIFT,
+    MAIN,
+    SHORT,
+    Measured,
+    SweepRow,
+    key_cells,
+    report_of,
+    table_of,
+)
+from rigidmd.features.studies.sweep.table import Table as SweepTable
+from rigidmd.features.view.figures.style import curve_style, write_figure
+from rigidmd.features.view.page import code, items, plain, section, table, wide, write_page
+from rigidmd.io.folder import SCENE, add_to_folder
+from rigidmd.io.write import Cell, Table, nine_digits
+from rigidmd.run.record import read_record
+from rigidmd.scene import MolecularScene, Scene
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+OPTION = "--extrapolate"
+FILES = ("extrapolation.csv", "extrapolation.png", "extrapolation.html")
+MOST_PANELS = 12
+RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+#: Kinds of limits: of each average by itself; of energy and volume together, with the slopes that
+#: fluctuations predict; of responses, which fluctuations give.
+INDEPENDENT, JOINT, FLUCTUATIONS = "independent", "joint", "fluctuations"
+#: Relative rounding error of a mean of equal numbers.
+ROUNDING = 1e-12
+
+
+class Limit(NamedTuple):
+    """A quantity at zero time step, for a combination of values of the keys other than the step and
+    the seed."""
+
+    values: Json
+    method: str  # integrator
+    quantity: str  # with its unit
+    points: list[MeanAtStep]
+    fit: BiasFit
+    kind: str = INDEPENDENT
+
+    def bias(self, step: float) -> tuple[float, float] | None:
+        """Mean at a step less limit, with its error. That of a joint fit by its slope. None without
+        a mean there."""
+        if self.kind == JOINT:
+            slope, error = self.fit.slopes[""]
+            return slope * step**2, error * step**2
+        return next((self.fit.bias(at) for at in self.points if at.timestep == step), None)
+
+    @property
+    def title(self) -> str:
+        return SHORT.get(self.quantity, self.quantity)
+
+    @property
+    def label(self) -> str:
+        return describe_values(self.values, short_keys(self.values))
+
+
+class Limits(NamedTuple):
+    name: str  # of the scene
+    key: str
+    limits: list[Limit]
+    missing: list[str]  # sentences on what has no limit
+    not_joint: list[str]  # on what has no joint fit
+
+    @property
+    def steps(self) -> list[float]:
+        return sorted({point.timestep for limit in self.limits for point in limit.points})
+
+    @property
+    def keys(self) -> list[str]:
+        return [*self.limits[0].values] if self.limits else []
+
+    @property
+    def title(self) -> str:
+        orders = [(str(limit.fit.order).translate(RAISED), limit.method) for limit in self.limits]
+        powers = dict.fromkeys(f"dt{order} ({method})" for order, method in orders)
+        return f"averages at a step of 0, from errors of order {', '.join(powers)} in {self.key}"
+
+    def as_text(self) -> Table:
+        """For readers: limits, chi² over its degrees of freedom, the longest step of the fit, and
+        biases."""
+        short = short_keys(self.keys)
+        lines = []
+        for limit in self.limits:
+            fit = limit.fit
+            line = {short[key]: cell for key, cell in key_cells(limit.values).items()}
+            line["average"] = limit.title
+            if any(limit.kind == JOINT for limit in self.limits):
+                line["fit"] = limit.kind
+            line["limit"] = fit.describe_limit()
+            line["chi²/dof"] = f"{fit.chi2:.2g}/{fit.freedom}" if fit.freedom else None
+            line["to (fs)"] = f"{fit.longest:g}"
+            for step in self.steps:
+                bias = limit.bias(step)
+                line[f"bias at {step:g} fs"] = None if bias is None else format_signed(*bias)
+            lines.append(line)
+        return report_of(lines)
+
+    def lines(self) -> list[dict[str, Cell]]:
+        """The lines of extrapolation.csv."""
+        lines = []
+        for limit in self.limits:
+            fit = limit.fit
+            line = key_cells(limit.values)
+            line["average"] = limit.quantity
+            line["fit"] = limit.kind
+            line["integrator"] = limit.method
+            line["order"] = fit.order
+            line["limit"] = nine_digits(fit.limit)
+            line["limit error"] = nine_digits(fit.limit_error)
+            line["chi2"] = nine_digits(fit.chi2) if fit.freedom else None
+            line["degrees of freedom"] = fit.freedom
+            line["longest step in fit (fs)"] = fit.longest
+            for step in self.steps:
+                name = f"bias at {step:g} fs"
+                bias, error = limit.bias(step) or (None, None)
+                line[name] = nine_digits(bias)
+                line[f"{name} error"] = nine_digits(error)
+            lines.append(line)
+        return lines
+
+
+def step_key(manifest: Manifest, key: str, scene: Scene) -> tuple[str, int]:
+    """The swept key that sets a time step, and the index of its stage. Raises SceneError.
+
+    key : that key, or one that varies together with it; scene : of one of the points
+    """
+    first = next((first for first, together in manifest.keys.items() if key in together), None)
+    stages = scene.stages if isinstance(scene, MolecularScene) else ()
+    last = max((k for k, stage in enumerate(stages) if not stage.is_minimisation), default=0)
+    label = stages[last].label if stages else ""
+    usual = f"stages.{last}.timestep_fs"
+    if first is not None and key in (usual, f"stages.{label}.timestep_fs"):
+        return first, last
+    if first is None:
+        varied = ", ".join(key for keys in manifest.keys.values() for key in keys)
+        problem = f"is not varied. This sweep varies {varied}"
+    elif key.startswith("stages.") and key.endswith(".timestep_fs"):
+        problem = f"is not the step of the stage whose averages are taken, the last one, {label}"
+    else:
+        problem = "is not the time step of a stage of molecules"
+    advice = f"give it a key such as --set {usual}=1,2,4 {OPTION} {usual}"
+    raise SceneError(OPTION, [f"{key} {problem}; {advice}"])
+
+
+@dataclass
+class _Average:
+    """An average of the combinations that differ in the step alone."""
+
+    values: Json  # of the other keys
+    quantity: str
+    integrator: str
+    order: int
+    #: Step (fs) -> value and error of each run; -> value of the runs together.
+    runs: dict[float, list[Measured]] = field(default_factory=dict)
+    together: dict[float, Together] = field(default_factory=dict)
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether all values agree to rounding, as edges of a box that does not change."""
+        values = [value for measured in self.runs.values() for value, _ in measured]
+        values = np.array(values + [result.value for result in self.together.values()])
+        return bool(np.ptp(values) <= ROUNDING * np.abs(values).max())
+
+
+def extrapolate_sweep(manifest: Manifest, key: str) -> Limits:
+    """Extrapolate all log averages in a sweep, and the values of its analyses, to a step of 0.
+
+    Values of analyses come from replicas together, if they have been analysed together, else from
+    single runs. Raises SceneError if the key is not a swept time step, OutputError.
+    """
+    limits, missing = [], []
+    for average in _averages(manifest, key):
+        if average.quantity == DRIFT or average.is_constant:
+            continue
+        title = describe_values(average.values, short_keys(manifest.keys))
+        name = f"{title}: {average.quantity}" if title else average.quantity
+        points = means_of_runs(average.runs, average.together)
+        if len(average.runs) < 2:
+            missing.append(f"{name}: has values at one step only")
+        elif points:
+            fit = extrapolate(points, order=average.order)
+            limits.append(Limit(average.values, average.integrator, average.quantity, points, fit))
+        else:
+            missing.append(f"{name}: the runs are too short and too few for an error")
+    joint, not_joint = _joint_limits(manifest, key)
+    return Limits(manifest.name, key, limits + joint, missing, not_joint)
+
+
+@dataclass
+class _Combination:
+    """Results of the runs that differ in the step and the seed alone, by the step (fs)."""
+
+    values: Json
+    integrator: str = ""
+    runs: dict[float, list[RunResults]] = field(default_factory=dict)
+
+
+def _joint_limits(manifest: Manifest, key: str) -> tuple[list[Limit], list[str]]:
+    """Limits of joint fits and of responses, and sentences on what has none."""
+    combinations: dict[str, _Combination] = {}
+    reasons: dict[str, None] = {}
+    short = short_keys(manifest.keys)
+    for values, points in manifest.combinations():
+        for point in points:
+            if point.state != "finished":
+                continue
+            try:
+                record = read_record(manifest.folder / point.folder)
+                found = results_of_run(record)
+            except RigidMDError:  # the table of the sweep names it
+                continue
+            first, k = step_key(manifest, key, record.scene)
+            others = {name: value for name, value in values.items() if name != first}
+            title = describe_values(others, short)
+            if isinstance(found, str):
+                reasons[f"{title}: {found}" if title else found] = None
+                continue
+            combination = combinations.setdefault(title, _Combination(others))
+            stage = record.scene.stages[k]  # pyright: ignore[reportAttributeAccessIssue]  (it has them)
+            combination.integrator = stage.integrator
+            combination.runs.setdefault(float(values[first]), []).append(found)
+    limits = []
+    for title, combination in combinations.items():
+        fits = fit_jointly(combination.runs)
+        common = combination.values, combination.integrator
+        for kind, by_quantity in ((JOINT, fits.joint), (FLUCTUATIONS, fits.responses)):
+            limits += [Limit(*common, name, *fit, kind) for name, fit in by_quantity.items()]
+        if not fits.joint:
+            reason = "the runs are too short and too few for an error"
+            reasons[f"{title}: {reason}" if title else reason] = None
+    return limits, list(reasons)
+
+
+def _averages(manifest: Manifest, key: str) -> Iterator[_Average]:
+    averages: dict[tuple[str, str], _Average] = {}
+    short = short_keys(manifest.keys)
+    rows = table_of(manifest, with_analyses=True).rows
+    for row, (_, points) in zip(rows, manifest.combinations(), strict=True):
+        if not row.runs:
+            continue
+        point = next(point for point in points if point.state == "finished")
+        scene = Scene.read(manifest.folder / point.folder / SCENE)
+        first, k = step_key(manifest, key, scene)
+        stage = scene.stages[k]  # pyright: ignore[reportAttributeAccessIssue]  (it has stages)
+        step = float(row.values[first])
+        others = {name: value for name, value in row.values.items() if name != first}
+        together = {}
+        if len(points) > 1:
+            together = _values_together(manifest.folder / point_name(row.values, short))
+        measured = {column: None for run in row.runs.values() for column in run}
+        for column in measured | together:
+            average = _Average(others, column, stage.integrator, stage.scheme.order)
+            average = averages.setdefault((describe_values(others, short), column), average)
+            average.runs[step] = [run[column] for run in row.runs.values() if column in run]
+            if column in together:
+                average.together[step] = together[column]
+    yield from averages.values()
+
+
+def _values_together(folder: Path) -> dict[str, Together]:
+    """The values of analyses of several runs together that have an error, by their headers. Raises
+    OutputError."""
+    return {
+        value.header: Together(value.value, value.error, entry.frames_used.runs)
+        for entry in read_table(folder).values()
+        for value in entry.values
+        if entry.frames_used.runs > 1 and value.value is not None and value.error is not None
+    }
+
+
+def write_limits(folder: Path, limits: Limits, command: str) -> list[str]:
+    """Write table, figure and page of limits. The names of the files. Raises OutputError."""
+    if not limits.limits:
+        return []
+    add_to_folder(folder, FILES)
+    report_of(limits.lines()).write(folder / FILES[0], quote_text=True)
+    write_figure(folder / FILES[1], lambda: _figure(limits), f"{limits.name}: {limits.title}")
+    title = f"{limits.name}: averages at a step of 0"
+    write_page(folder / FILES[2], title, _parts(limits, command))
+    return [name for name in FILES if (folder / name).is_file()]
+
+
+def _parts(limits: Limits, command: str) -> Iterator[str]:
+    note = "mean = limit + slope · dt^order, up to the longest step that chi² allows (column `to`)"
+    rows = table(*limits.as_text().shown())
+    drawn = wide(_figure(limits), "extrapolation", "means over the time step, and their limits")
+    yield f'<p class="faint">{plain(limits.title)}</p>'
+    yield section("Limits and biases", rows, items([note, *limits.missing, *limits.not_joint]))
+    yield section("Means against the time step", drawn)
+    yield section("How to repeat it", code(command))
+
+
+def _figure(limits: Limits):
+    """A panel for each of the main averages: means with error bars, the fit, and the limit with its
+    error at 0."""
+    of_log = [column.header for column in COLUMNS.values()]
+
+    def rank(name: str) -> int:
+        return MAIN.index(name) if name in MAIN else len(MAIN) + (name in of_log)
+
+    independent = [limit for limit in limits.limits if limit.kind == INDEPENDENT]
+    quantities = dict.fromkeys(limit.quantity for limit in independent)
+    shown = sorted(quantities, key=rank)[:MOST_PANELS]
+    rows: dict[tuple[str, float], SweepRow] = {}
+    for limit in independent:
+        for point in limit.points:
+            row = SweepRow({limits.key: point.timestep} | limit.values, {None: {}})
+            row = rows.setdefault((limit.label, point.timestep), row)
+            row.runs[None][limit.quantity] = point.mean, point.error
+    means = SweepTable(Path(), [limits.key, *limits.keys], list(rows.values()), shown)
+    figure = draw_table(means, shown, connected=False)
+    labels = list(dict.fromkeys(limit.label for limit in independent))
+    for limit in independent:
+        if limit.quantity in shown:
+            axis = figure.axes[shown.index(limit.quantity)]
+            _draw_limit(axis, limit.fit, labels.index(limit.label))
+    return figure
+
+
+def _draw_limit(axis: "Axes", fit: BiasFit, k: int) -> None:
+    style = curve_style(k, connected=False)
+    axis.errorbar(
+        [0],
+        [fit.limit],
+        [fit.limit_error],
+        ms=4,
+        capsize=2.5,
+        mfc="none",
+        clip_on=False,
+        **style,
+    )
+    step = np.linspace(0, fit.longest, 60)
+    slope = fit.slopes[""][0] if fit.slopes else 0.0
+    axis.plot(step, fit.limit + slope * step**fit.order, color=style["color"], lw=0.9)
+    axis.set_xlim(left=0)

@@ -1,0 +1,276 @@
+"""The table of a sweep: a line for each combination of values with means and errors over its
+replicas."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from math import isfinite, nan
+from operator import itemgetter
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rigidmd.core.display import Displayed
+from rigidmd.core.statistics import format_with_error, mean_and_error, standard_error
+from rigidmd.core.toml import Json
+from rigidmd.engines.samples import BODY_COLUMNS, IN_LOGS, NOT_AVERAGED
+from rigidmd.engines.system import System
+from rigidmd.errors import RigidMDError
+from rigidmd.features.analysis.files import TableEntry, read_table
+from rigidmd.features.analysis.result import AnalysisResult
+from rigidmd.features.analysis.rigid_frames import earlier_production, production_samples
+from rigidmd.features.bodies.system import BodySystem
+from rigidmd.features.studies.sweep.folder import (
+    SEED,
+    Manifest,
+    readable_key,
+    short_keys,
+    value_name,
+)
+from rigidmd.io.write import Cell, Column, nine_digits
+from rigidmd.io.write import Table as ReportTable
+from rigidmd.run.record import Record, read_record
+
+if TYPE_CHECKING:
+    import pandas
+
+POTENTIAL, DRIFT = "Potential Energy per molecule (kJ/mole)", "Drift (kT/ns per degree of freedom)"
+DENSITY, PRESSURE = "Density (g/mL)", "Pressure (bar)"
+#: Columns of the printed table and the figure: for molecules, for a body.
+MAIN = ("Temperature (K)", POTENTIAL, PRESSURE, DENSITY, DRIFT)
+MAIN_OF_BODY = (
+    "theta lowest (rad)",
+    "theta highest (rad)",
+    "energy end (J)",
+    "energy_error largest",
+    "L_size_error largest",
+)
+#: Short titles for the printed table.
+SHORT = {POTENTIAL: "U per molecule (kJ/mol)", DRIFT: "drift (kT/ns/DOF)"}
+#: The box, whose averages over an earlier stage are in the table if that stage changes it.
+OF_BOX = tuple(IN_LOGS[name].header for name in ("volume", "a", "b", "c", "alpha", "beta", "gamma"))
+#: Columns of a body that are not in the table; nor are the entries of Q and of the quaternion.
+NOT_OF_BODY = ("time", "orthogonality_error")
+OF_ROTATION = ("q1", "q2", "q3", "qw", "qx", "qy", "qz")
+
+#: A value and its error, or None.
+Measured = tuple[float, float | None]
+
+
+@dataclass
+class SweepRow:
+    """A combination of values for all keys except the seed, and the results of its runs."""
+
+    values: Json
+    #: Value of the seed, None if it is not swept -> column -> value and error of that run.
+    runs: dict[object, dict[str, Measured]] = field(default_factory=dict)
+    together: int = 0  # number of runs whose common results are those of one run here
+
+    @property
+    def count(self) -> int:
+        """Number of runs."""
+        return self.together or len(self.runs)
+
+    def __getitem__(self, column: str) -> Measured:
+        """Mean over the runs and its standard error. For one run its value and error. NaN without a
+        value."""
+        measured = [run[column] for run in self.runs.values() if column in run]
+        if len(measured) < 2:
+            return measured[0] if measured else (nan, None)
+        values = np.array([value for value, _ in measured])
+        if np.ptp(values) == 0:  # a constant has no error, which rounding would give it
+            return float(values[0]), None
+        return float(values.mean()), float(standard_error(values))
+
+
+@dataclass
+class Table(Displayed):
+    """Results of a sweep: a row for each combination of values, columns of means and errors.
+
+    table["Temperature (K)"] is a column of means as an array (rows,), table.error("Temperature
+    (K)") of their errors, table["seed"] of the values of a key. failed : point -> why it has no
+    results. runs : point that has finished -> folder of its run, for `rigidmd.read_run`
+    """
+
+    folder: Path
+    keys: list[str]
+    rows: list[SweepRow]
+    columns: list[str]
+    failed: dict[str, str] = field(default_factory=dict)
+    runs: dict[str, Path] = field(default_factory=dict)
+    #: Key -> the keys that vary together with it, itself included.
+    together: dict[str, list[str]] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __repr__(self) -> str:
+        keys = ", ".join(self.keys) or "no keys"
+        return f"<Table of {len(self)} combinations of {keys} in {self.folder}>"
+
+    def __getitem__(self, column: str) -> np.ndarray:
+        """A column of means, or of the values of a key. Raises KeyError with all names."""
+        if column in self.keys:
+            return np.array([row.values[column] for row in self.rows])
+        return self._measured(column)[:, 0]
+
+    def error(self, column: str) -> np.ndarray:
+        """Standard errors of a column of means: over the runs of a row, or of its single run. NaN
+        without one."""
+        return self._measured(column)[:, 1]
+
+    def _measured(self, column: str) -> np.ndarray:
+        if column not in self.columns:
+            names = ", ".join([*self.keys, *self.columns])
+            raise KeyError(f"no column {column!r}; there are {names}")
+        return np.array([row[column] for row in self.rows], float).reshape(-1, 2)
+
+    def has_error(self, column: str) -> bool:
+        return bool(np.isfinite(self.error(column)).any())
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """The table of sweep.csv. Raises ImportError without pandas."""
+        try:
+            import pandas
+        except ImportError:
+            raise ImportError("to_dataframe() needs pandas: pip install pandas") from None
+        return pandas.DataFrame(self.lines())
+
+    def lines(self) -> list[dict[str, Cell]]:
+        """The lines of sweep.csv: values of keys, number of runs, and each column with its
+        error."""
+        with_error = {name for name in self.columns if self.has_error(name)}
+        lines = []
+        for row in self.rows:
+            line = key_cells(row.values) | {"runs": row.count}
+            for name in self.columns:
+                mean, error = row[name]
+                line[name] = nine_digits(mean)
+                if name in with_error:
+                    line[f"{name} error"] = nine_digits(error)
+            lines.append(line)
+        return lines
+
+    def brief(self) -> ReportTable:
+        """The table that is printed and displayed: keys, number of runs, and the main columns with
+        their errors."""
+        short = short_keys(self.keys)
+        headers = {key: f"set {readable_key(short[key])}" for key in self.keys}
+        lines = []
+        for row in self.rows:
+            line = {headers[key]: value_name(value) for key, value in row.values.items()}
+            line["runs"] = str(row.count)
+            for name in self.main_columns():
+                mean, error = row[name]
+                text = format_with_error(mean, error) if isfinite(mean) else "-"
+                line[SHORT.get(name, name)] = text
+            lines.append(line)
+        return report_of(lines)
+
+    def main_columns(self) -> list[str]:
+        """The columns that are printed and drawn: the main ones, and the densities of stages before
+        the last one."""
+        earlier = [column for column in self.columns if column.endswith(f": {DENSITY}")]
+        return [name for name in (*MAIN, *MAIN_OF_BODY) if name in self.columns] + earlier
+
+
+def report_of(lines: Sequence[Mapping[str, Cell]]) -> ReportTable:
+    """A table of lines with the same headers."""
+    headers = lines[0] if lines else ()
+    return ReportTable([Column(header, itemgetter(header)) for header in headers], lines)
+
+
+def key_cells(values: Json) -> dict[str, Cell]:
+    """The values of the keys of a combination, as cells of a file."""
+    return {
+        key: value if type(value) in (int, float, str) else value_name(value)
+        for key, value in values.items()
+    }
+
+
+def table_of(manifest: Manifest, with_analyses: bool = False) -> Table:
+    """The table of the points that have finished. with_analyses : also of the values of analyses in
+    their folders"""
+    keys = [key for key in manifest.keys if key != SEED]
+    table = Table(manifest.folder, keys, [], [], together=manifest.keys)
+    columns: dict[str, None] = {}
+    for values, points in manifest.combinations():
+        table.rows.append(SweepRow(values))
+        for point in points:
+            folder = manifest.folder / point.folder
+            if point.state != "finished":
+                continue
+            try:
+                results = summarise_run(read_record(folder))
+                if with_analyses:
+                    results |= measured_values(read_table(folder).values())
+            except RigidMDError as error:
+                table.failed[point.folder] = str(error)
+                continue
+            table.rows[-1].runs[point.values.get(SEED)] = results
+            table.runs[point.folder] = folder
+            columns |= dict.fromkeys(results)
+    table.columns[:] = columns
+    return table
+
+
+def measured_values(results: Iterable[AnalysisResult | TableEntry]) -> dict[str, Measured]:
+    """The values of results of analyses by their headers."""
+    return {
+        value.header: (value.value, value.error)
+        for result in results
+        for value in result.values
+        if value.value is not None
+    }
+
+
+def summarise_run(record: Record) -> dict[str, Measured]:
+    """Results of a run: means over the production of molecules, extremes of the motion of a body.
+    Raises OutputError."""
+    if record.is_body:
+        return _summarise_motion(record)
+    _, production = production_samples(record)
+    results = _means_of(record, production)
+    for stage, samples in earlier_production(record):
+        means = _means_of(record, samples)
+        headers = [*MAIN, *OF_BOX] if stage.changes_box else [*MAIN]
+        for header in headers:
+            if header in means and (stage.changes_box or header != DENSITY):
+                results[f"{stage.label}: {header}"] = means[header]
+    last = ((record.summary or {}).get("stages") or [{}])[-1]
+    drift = last.get("drift_kT_ns_per_degree_of_freedom")
+    if drift is not None:
+        results[DRIFT] = drift, last.get("drift_error_kT_ns_per_degree_of_freedom")
+    return results
+
+
+def _means_of(record: Record[System], samples: np.ndarray) -> dict[str, Measured]:
+    """Means of the columns of the log over some samples. A constant has no error."""
+    means: dict[str, Measured] = {}
+    described = record.log.described
+    for name, values in record.columns.items():
+        if name in NOT_AVERAGED:
+            continue
+        average, error = mean_and_error(values[samples])
+        if average is None:
+            continue
+        means[described[name].header] = average, error or None
+        if name == "potential":
+            n = len(record.system.model.species)
+            means[POTENTIAL] = average / n, None if error is None else error / n
+    return means
+
+
+def _summarise_motion(record: Record[BodySystem]) -> dict[str, Measured]:
+    results: dict[str, Measured] = {}
+    for name, values in record.columns.items():
+        if name in NOT_OF_BODY or name[:2] in OF_ROTATION or not np.isfinite(values).all():
+            continue
+        if name.endswith("_error"):
+            results[f"{name} largest"] = float(np.abs(values).max()), None
+            continue
+        unit = BODY_COLUMNS[name].unit if name in BODY_COLUMNS else "1"
+        numbers = values.mean(), values.min(), values.max(), values[-1]
+        for word, number in zip(("mean", "lowest", "highest", "end"), numbers, strict=True):
+            results[f"{name} {word} ({unit})"] = float(number), None
+    return results

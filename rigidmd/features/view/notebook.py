@@ -1,0 +1,199 @@
+"""The display of scenes, simulations, results (tables and a figure, light or dark) and animations
+in a notebook."""
+
+import html
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from rigidmd.assemble.describe import describe, describe_system
+from rigidmd.core.display import html as html_of
+from rigidmd.core.files import write_text
+from rigidmd.core.statistics import format_with_error
+from rigidmd.engines.system import System
+from rigidmd.errors import InputError, OutputError
+from rigidmd.features.analysis.result import AnalysisResult, Value
+from rigidmd.features.bodies.animation import BodyAnimation
+from rigidmd.features.bodies.system import BodySystem
+from rigidmd.features.view.figures.run import run_figures
+from rigidmd.features.view.molecule_animation import (
+    MoleculeAnimation,
+    chemiscope_script,
+    frames_of,
+    inside,
+)
+from rigidmd.features.view.page import Raw, code, figure, items, notes, page, read_asset, table
+from rigidmd.features.view.plots import record_of
+from rigidmd.features.view.run_page import FILM_STYLE, animation_parts
+from rigidmd.io.trajectory import Frames
+from rigidmd.run.record import Record
+from rigidmd.run.report import body_rows, body_title, stage_rows, stage_title
+from rigidmd.run.results import Results
+from rigidmd.run.simulation import Simulation
+from rigidmd.scene import BodyScene, MolecularScene, Scene
+
+if TYPE_CHECKING:
+    from rigidmd.features.view.figures.picture import Picture
+
+STYLE = read_asset("notebook.css")
+
+
+@html_of.register
+def scene_html(scene: Scene) -> str:
+    kind = "one rigid body" if isinstance(scene, BodyScene) else "rigid molecules"
+    try:
+        text = code(describe(cast("MolecularScene | BodyScene", scene), user_code=False))
+    except InputError as error:
+        text = f"<p>{html.escape(scene.in_short)}</p>{items(error.errors)}"
+    return framed(scene.name, kind, text)
+
+
+@html_of.register
+def simulation_html(simulation: Simulation) -> str:
+    folder = simulation.folder
+    where = "nowhere: the results stay in memory" if folder is None else str(folder)
+    rows = [("threads", str(simulation.threads)), ("writes to", where)]
+    if names := [type(observer).__name__ for observer in simulation._observers]:
+        rows.append(("observers", ", ".join(names)))
+    text = code(describe_system(simulation.system)) + table([], rows, words=True)
+    return framed(simulation.scene.name, "ready to run: run() does it", text)
+
+
+@html_of.register
+def results_html(results: Results) -> str:
+    summary = results.summary
+    name = results.system.scene.name
+    if isinstance(results.system, BodySystem):
+        # "steps": not of a run that has not ended
+        parts = [(body_title(summary), body_rows(summary))] if "steps" in summary else []
+    else:
+        parts = [(stage_title(stage), stage_rows(stage)) for stage in summary["stages"]]
+    text = [f"<p>{html.escape(title)}</p>{table([], rows, words=True)}" for title, rows in parts]
+    stem, drawn = next(
+        iter(run_figures(results.system, results.samples, summary).items()), ("", None)
+    )
+    left = f"{''.join(text)}{notes(summary['notes'])}"
+    right = _drawing(drawn, f"{name}-{stem}", f"figure: {stem}")
+    return framed(name, results._summary_line, f"{_sides(left, right)}{_columns(results)}")
+
+
+@html_of.register
+def analysis_html(result: AnalysisResult) -> str:
+    rows = [(value.name, _measured(value), value.note) for value in result.values]
+    right = _drawing(
+        result.plot() if result.curves else None, f"analysis-{result.name}", result.about
+    )
+    left = f"{table([], rows, words=True)}{notes(result.notes)}"
+    return framed(result.name, result.about, _sides(left, right))
+
+
+def _measured(value: Value) -> str:
+    """A value with its error and unit. Empty without one, as its note has the reason."""
+    unit = "" if value.unit in ("", "1") else f" {value.unit}"
+    return "" if value.value is None else f"{format_with_error(value.value, value.error)}{unit}"
+
+
+def _sides(left: str, right: str) -> str:
+    """Text and figure side by side."""
+    return f'<div class="sides"><div>{left}</div>{f"<div>{right}</div>" if right else ""}</div>'
+
+
+def _drawing(drawing: "Picture | None", salt: str, about: str) -> str:
+    """A figure in the colours of the notebook, or on white if it has a shaded solid. Empty without
+    one."""
+    if drawing is None:
+        return ""
+    svg = figure(drawing, salt, about).replace("#000000", "var(--ink)")
+    # not of the rest of the notebook
+    svg = svg.replace("*{stroke-linejoin", ".rigidmd svg *{stroke-linejoin")
+    return f'<div class="{"paper" if "<image" in svg else "figure"}">{svg}</div>'
+
+
+def framed(name: str, about: str, body: str) -> str:
+    """A block of HTML in the style of the package, with a name and what it is."""
+    head = (
+        f'<div class="head">{html.escape(name)} <span'
+        f' class="faint">{html.escape(about)}</span></div>'
+    )
+    return f'<style>{STYLE}</style><div class="rigidmd">{head}{body}</div>'
+
+
+def _columns(results: Results) -> str:
+    """All columns with their units, folded."""
+    described = results.samples.described.items()
+    rows = [(Raw(f"<code>{name}</code>"), column.unit, column.about) for name, column in described]
+    listed = table(["column", "unit", ""], rows, words=True)
+    title = f"{len(results.units)} columns: results[name]"
+    return f"<details><summary>{title}</summary>{listed}</details>"
+
+
+#: Maximum number of coordinates in a notebook.
+MOST_COORDINATES = 1_500_000
+#: Height of a frame, pixels.
+HEIGHT = 720
+
+
+class AnimationPage:
+    """A page with an animation, which a notebook shows in a frame. `page` is its HTML."""
+
+    def __init__(self, page: str):
+        self.page = page
+
+    def _repr_html_(self) -> str:
+        return (
+            f'<iframe srcdoc="{html.escape(self.page)}"'
+            f' style="width:100%;height:{HEIGHT}px;border:0"></iframe>'
+        )
+
+    def save(self, path: str | Path) -> Path:
+        """Write the page, replacing a file of that name. Raises OutputError."""
+        path = Path(path)
+        write_text(path, self.page)
+        return path
+
+
+def show(results: Results) -> AnimationPage:
+    """The animation of a run in a notebook, on a small page with the plots.
+
+    Raises
+    ------
+    ImportError
+        For molecules, without chemiscope.
+    ValueError
+        Without a trajectory.
+    """
+    system = results.system
+    record = record_of(system, results.samples, results.summary)
+    try:
+        if isinstance(system, BodySystem):
+            animation = BodyAnimation(record)
+        else:
+            chemiscope_script()
+            animation = MoleculeAnimation(record, frames=_frames(results, system, record))
+    except OutputError as error:
+        kind = ImportError if "chemiscope" in str(error) else ValueError
+        raise kind(str(error)) from None
+    return AnimationPage(page(record.scene.name, animation_parts(record, animation), FILM_STYLE))
+
+
+def _frames(results: Results, system: System, record: Record) -> Frames:
+    """The frames of a run, from its files or from memory."""
+    if not system.scene.output.trajectory or not results._frames:
+        raise OutputError("this run has no frames (output.trajectory = false)")
+    most = max(2, MOST_COORDINATES // (3 * len(system.sites.mass)))
+    if results.files:
+        return frames_of(replace(record, folder=results.files[0].parent), most)
+    count = len(results._frames)
+    stride = max(1, -(-count // most))
+    chosen = results._frames[::stride]
+    frames = Frames(
+        time=np.array([frame.time for frame in chosen]),
+        positions=np.array([frame.positions for frame in chosen]),
+        cells=np.array([frame.cell for frame in chosen]) if system.density else None,
+        count=count,
+        stride=stride,
+        is_cut=False,
+    )
+    return inside(frames, system.sites)

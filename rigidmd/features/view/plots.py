@@ -1,0 +1,194 @@
+"""Plots of columns against time: small ones for pages, where animations add a cursor, figures, and
+live ones."""
+
+import time as clock
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from rigidmd.core.toml import Json
+from rigidmd.engines.samples import BODY_COLUMNS, MATRIX, Column, Samples
+from rigidmd.engines.system import System
+from rigidmd.features.bodies.motion import Motion
+from rigidmd.features.bodies.system import BodySystem
+from rigidmd.features.view.figures.panels import Panel, draw_rows, panels, stack, timeline
+from rigidmd.features.view.figures.picture import Picture
+from rigidmd.features.view.figures.run import run_figures
+from rigidmd.features.view.figures.style import new_figure
+from rigidmd.features.view.page import figure as figure_part
+from rigidmd.io.progress import DisplayArea, in_notebook
+from rigidmd.run.observers import Moment, Observer
+from rigidmd.run.record import Record
+from rigidmd.run.results import Results
+from rigidmd.run.simulation import Simulation
+from rigidmd.scene import BodyScene, MolecularScene
+from rigidmd.scene.validation import did_you_mean, not_none
+
+#: Inches: narrow, to be readable on a phone.
+WIDTH, HEIGHT = 4.4, 2.3
+
+
+def plots_part(record: Record) -> str:
+    """All plots as HTML. Attributes for the animation: data-box, the ends of the axis as fractions
+    of the figure (left, right, top, bottom), data-from and data-to, the limits of its times."""
+    figures = []
+    times = timeline(record.system, record.columns)
+    for k, panel in enumerate(panels(record.system, record.columns)):
+        figure = new_figure(WIDTH, HEIGHT, layout=None)
+        (axis,) = draw_rows(figure, [[(times, panel)]], (0.0, 0.0, WIDTH, HEIGHT))
+        svg = figure_part(figure, f"panel{k}", panel.title)
+        box, (left, right) = axis.get_position(), axis.get_xlim()
+        ends = " ".join(f"{end:.5f}" for end in (box.x0, box.x1, 1 - box.y1, 1 - box.y0))
+        limits = f'data-from="{left:.9g}" data-to="{right:.9g}"'
+        figures.append(f'<figure data-box="{ends}" {limits}>{svg}</figure>')
+    return f'<div class="plots">{"".join(figures)}</div>'
+
+
+def record_of(
+    system: System | BodySystem,
+    samples: Samples | Motion,
+    summary: Json | None,
+    names: Sequence[str] | None = None,
+) -> Record:
+    """A run in memory as a record, with all its columns or with the named ones and the time."""
+    wanted = samples.described if names is None else ("time", "stage", *names)
+    columns = {
+        name: samples[name] for name in wanted if name in samples.described and name != MATRIX
+    }
+    return Record(Path(), system.scene, system, summary, columns, [])
+
+
+def plot(results: Results, *columns: str, log: bool = False) -> Picture:
+    """A Matplotlib figure of a run, which a notebook displays and `savefig` writes.
+
+    Parameters
+    ----------
+    columns
+        Names of columns, drawn against time, with one panel for each unit. Default: the main figure
+        of the run (energy.png, or the path of the axis of a body), or the name of another figure of
+        a body ("angles", "ellipsoids", "path", "invariants")
+    log
+        Absolute values on a logarithmic axis. Raises KeyError
+    """
+    figures = {}
+    if not set(columns[:1]) & set(results.units):
+        figures = run_figures(results.system, results.samples, results.summary)
+    if not columns and not figures:
+        raise ValueError(f"too few samples for a figure: {len(results.samples)}")
+    wanted = columns or tuple(figures)[:1]
+    if len(wanted) == 1 and wanted[0] in figures:
+        return figures[wanted[0]]
+    check_names(columns, results.samples.described, figures)
+    record = record_of(results.system, results.samples, results.summary, list(columns))
+    return columns_figure(record, columns, results.samples.described, log=log)
+
+
+def check_names(
+    names: Sequence[str], described: dict[str, Column], figures: Iterable[str] = ()
+) -> None:
+    """Raise KeyError, with a suggestion, for a name that is not a column of numbers."""
+    known = [name for name, column in described.items() if column.unit and name != MATRIX]
+    for name in (name for name in names if name not in known):
+        if name in described:
+            kind = "matrices" if name == MATRIX else "text"
+            raise KeyError(f"column {name!r} has {kind}, which are not plotted")
+        others = f"; there are {', '.join([*known, *figures])}"
+        raise KeyError(f"no column {name!r}{did_you_mean(name, [*known, *figures]) or others}")
+
+
+def columns_figure(
+    record: Record, names: Sequence[str], described: dict[str, Column], *, log: bool = False
+) -> Picture:
+    """Columns against time, with one panel for each unit."""
+    units: dict[str, list[str]] = {}
+    for name in dict.fromkeys(names):
+        units.setdefault(described[name].unit, []).append(name)
+    times = timeline(record.system, record.columns)
+    rows = []
+    for unit, members in units.items():
+        labels = [name.removesuffix(f"_{unit}").replace("_", " ") for name in members]
+        values = [record.columns[name] for name in members]
+        curves = [(label, np.abs(y) if log else y) for label, y in zip(labels, values, strict=True)]
+        title = ", ".join(labels) + (f" ({unit})" if unit != "1" else "")
+        rows.append([(times, Panel(title, curves, log))])
+    return stack(rows, record.scene.name)
+
+
+#: Default columns; for a body the first one that it has.
+MOLECULES, BODY = ("temperature", "drift"), ("energy_error", "energy")
+#: Drawing takes at most this fraction of the time of a run.
+TIME_FRACTION = 0.2
+
+
+class LivePlot(Observer):
+    """Draws columns of the samples so far in the output of a notebook cell. Elsewhere it does
+    nothing.
+
+    Parameters
+    ----------
+    columns
+        names, as in `results[...]`. Default: temperature and drift, for a body energy_error
+    interval
+        Of the run (ps, s for a body) between two drawings. Default: the interval of its samples
+    pause
+        Least seconds between two drawings, which take at most a fifth of the time
+    """
+
+    ends = draws = True
+
+    def __init__(self, *columns: str, interval: float | None = None, pause: float = 0.5):
+        self.interval = self._asked = interval
+        self._columns, self._pause = columns, pause
+        self._spot: DisplayArea | None = None
+
+    def begin(self, run: Simulation) -> None:
+        """Prepare the drawing.
+
+        Raises
+        ------
+        KeyError
+            For an unknown column.
+        """
+        self._run, self._due = run, 0.0
+        scene = cast(MolecularScene | BodyScene, run.scene)
+        if isinstance(scene, BodyScene):
+            described = BODY_COLUMNS
+            every = not_none(scene.output.interval_s)
+        else:
+            described = run._part.samples().described
+            every = scene.output.log_interval_ps
+        self.interval = every if self._asked is None else self._asked
+        check_names(self._columns, described)
+        self._spot = DisplayArea() if in_notebook() else None
+
+    def see(self, moment: Moment) -> None:
+        if clock.monotonic() >= self._due:
+            self._draw()
+
+    def end(self, run: Simulation, results: Results) -> None:
+        self._draw()
+
+    def failed(self, run: Simulation) -> str:
+        self._draw()
+        return ""
+
+    def _draw(self) -> None:
+        if self._spot is None:
+            return
+        began = clock.monotonic()
+        samples = self._run._part.samples()
+        if len(samples) < 2:
+            return
+        described = samples.described
+        names = self._columns or MOLECULES
+        if not self._columns and "drift" not in described:
+            names = [name for name in BODY if name in described][:1]
+        check_names(names, described)
+        record = record_of(self._run.system, samples, None, names)
+        png, size = columns_figure(record, names, described).png()
+        text = f"{', '.join(names)} against time"
+        self._spot.show({"image/png": png, "text/plain": text}, {"image/png": size})
+        now = clock.monotonic()
+        self._due = now + max(self._pause, (now - began) * (1 / TIME_FRACTION - 1))

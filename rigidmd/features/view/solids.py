@@ -1,0 +1,79 @@
+"""Bodies with potentials of two bodies as solids: ellipsoids, and spheres with a patch."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.engines.system import System
+from rigidmd.features.potentials.poses.bodies import bodies_of_potentials
+from rigidmd.features.potentials.poses.gay_berne import GayBerne
+from rigidmd.features.potentials.poses.patch import Patch
+from rigidmd.features.view.molecule_figure import color_of
+from rigidmd.formats.bonds import COVALENT
+from rigidmd.run.rigid_fit import Bodies
+
+#: Colours of ellipsoids along x, y and z; in between they are mixed.
+DIRECTIONS = np.array([[0.80, 0.32, 0.22], [0.20, 0.60, 0.36], [0.20, 0.42, 0.76]])
+BALL, PATCH = np.array([0.72, 0.76, 0.82]), np.array([0.85, 0.35, 0.20])
+#: A patch is a smaller sphere off the centre of the ball: both in the radius of the ball.
+PATCH_RADIUS, PATCH_OFFSET = 0.9, 0.2
+#: Radius of a sphere in covalent radii, by which bonded spheres touch; default radius, Å.
+SPHERE_SCALE, DEFAULT_RADIUS = 1.15, 1.2
+
+
+class Solids(NamedTuple):
+    """Ellipsoids (s,), each fixed in a molecule, with the axis of symmetry as their third one."""
+
+    molecule: np.ndarray  # (s,)
+    offset_body: np.ndarray  # (s, 3) from the centre of mass, Å
+    frame: np.ndarray  # (s, 3, 3) from the axes of the ellipsoid to the body frame
+    semi_axes: np.ndarray  # (s, 3) Å
+    color: np.ndarray  # (s, 3) 0 to 1; NaN for one by the direction of its axis
+
+    def poses(self, bodies: Bodies) -> tuple[np.ndarray, np.ndarray]:
+        """Centres (s, 3) and rotations (s, 3, 3) from the axes of the ellipsoids to the lab."""
+        Q = bodies.Q[self.molecule]
+        arms = np.einsum("sij,sj->si", Q, self.offset_body)
+        return bodies.position[self.molecule] + arms, Q @ self.frame
+
+    def colors(self, rotation: np.ndarray) -> np.ndarray:
+        """Colours (s, 3) at rotations (s, 3, 3)."""
+        of_direction = rotation[:, :, 2] ** 2 @ DIRECTIONS
+        return np.where(np.isnan(self.color), of_direction, self.color)
+
+
+def solids_of(system: System) -> Solids | None:
+    """The solids of a system, and its other sites with mass as spheres; None if no potential has a
+    shape."""
+    rows: list[tuple] = []
+    drawn: set[str] = set()
+    for bodies in bodies_of_potentials(system):
+        name = bodies.species.name
+        potential = bodies.potential
+        if name in drawn or type(potential.function) not in (GayBerne, Patch):
+            continue
+        drawn.add(name)
+        values = potential.parameters[name]
+        offset = bodies.reference
+        k = "xyz".index(potential.axis or "z")
+        frame = bodies.frame[:, [k - 2, k - 1, k]]
+        for m in bodies.molecule.tolist():
+            if isinstance(potential.function, Patch):
+                radius = values["sigma_A"] / 2
+                rows.append((m, offset, frame, [radius] * 3, BALL))
+                moved = offset + PATCH_OFFSET * radius * frame[:, 2]
+                rows.append((m, moved, frame, [PATCH_RADIUS * radius] * 3, PATCH))
+            else:
+                wide, long = values["width_A"] / 2, values["length_A"] / 2
+                rows.append((m, offset, frame, [wide, wide, long], np.full(3, np.nan)))
+    if not rows:
+        return None
+    sites = system.sites
+    for s in np.flatnonzero(sites.mass > 0).tolist():
+        species = system.species[system.model.species[sites.molecule[s]]]
+        if species.name not in drawn:
+            element = str(sites.element[s])
+            radius = SPHERE_SCALE * COVALENT.get(element, 0.0) or DEFAULT_RADIUS
+            place = (sites.molecule[s], sites.offset_body[s], np.eye(3))
+            rows.append((*place, [radius] * 3, color_of(element)))
+    return Solids(*(np.array(column) for column in zip(*rows, strict=True)))
