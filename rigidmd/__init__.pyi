@@ -4,6 +4,7 @@ from .assemble.scenes import atoms_of as atoms_of
 from .assemble.scenes import resolve as resolve
 from .assemble.scenes import scene_from_atoms as scene_from_atoms
 from .features import view as view
+from .features.analysis import analysis as analysis
 from .features.free_energy.lambda_sweep import free_energy as free_energy
 from .features.free_energy.virial import second_virial as second_virial
 from .features.free_energy.windows import pmf as pmf
