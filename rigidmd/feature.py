@@ -6,11 +6,11 @@ module `feature`, a subclass of `Feature`: the core calls its methods for scenes
 feature may be absent: its folder is not there, and a scene that needs it ends with one sentence.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from types import ModuleType
 from typing import TypeVar
 
@@ -31,12 +31,14 @@ class Row:
     name: str  # of its folder
     summary: str
     needs: tuple[str, ...] = ()  # features that it imports
-    #: Keys of scenes that it adds, such as "forces.formulas" and "stages.lambda". A scene that has
-    #: one uses the feature
+    #: Keys of scenes that belong to it, such as "forces.custom", or "stages.thermostat=NAME" for
+    #: one value. A scene in which one has a value uses the feature
     keys: tuple[str, ...] = ()
+    provides: tuple[str, ...] = ()  # methods of its `Feature` that commands of the core call
     commands: tuple[str, ...] = ()  # modules of its folder `commands`
     formats: tuple[str, ...] = ()  # modules that register file formats
     analyses: tuple[str, ...] = ()  # modules that register analyses
+    programs: tuple[str, ...] = ()  # folders with a program, see `core.programs`
     display: str = ""  # the module that registers functions of `core.display`
 
     @property
@@ -50,14 +52,17 @@ class Row:
     def module(self, name: str, needed_by: str = "this") -> ModuleType:
         """A module of the feature. Raises MissingFeatureError."""
         if not self.is_installed:
-            raise MissingFeatureError(
-                f"{needed_by} needs the feature {self.name} ({self.summary}), which is not"
-                " installed: install rigidmd with all its features"
-            )
+            raise self.missing(needed_by)
         return import_module(f"{self.package}.{name}")
 
-    def load(self, needed_by: str = "this") -> "Feature":
-        """What the feature does. Raises MissingFeatureError."""
+    def missing(self, needed_by: str) -> MissingFeatureError:
+        return MissingFeatureError(
+            f"{needed_by} needs the feature {self.name} ({self.summary}), which is not installed:"
+            " install rigidmd with all its features"
+        )
+
+    def load(self, needed_by: str = "this"):
+        """Its `Feature`. Raises MissingFeatureError."""
         return self.module("feature", needed_by).FEATURE
 
 
@@ -73,11 +78,23 @@ class Feature:
         SceneError."""
         return system
 
+    def observers(self, system: object) -> list:
+        """The observers (`run.observers`) that write the files of the feature in a run."""
+        return []
 
-def modules(rows: tuple[Row, ...], kind: str) -> Iterator[tuple[str, str]]:
-    """(name, full name) of the modules of installed features that add "commands", "formats"
-    or "analyses"."""
-    for row in rows:
-        if getattr(row, kind) and row.is_installed:
-            folder = f"{row.package}.commands" if kind == "commands" else row.package
-            yield from ((name, f"{folder}.{name}") for name in getattr(row, kind))
+    def draw_model(self, path: Path, molecule: object, *, force: bool) -> None:
+        """Write a picture of a molecular model."""
+        raise NotImplementedError
+
+    def engine(self, system: object, stage: int) -> object:
+        """The engine of a program of the feature, for a stage. Raises SceneError with all that it
+        lacks. EngineError if the program is not installed."""
+        raise NotImplementedError
+
+    def describe_engine(self, system: object) -> str:
+        """What is installed of the program of a system. Raises SceneError."""
+        raise NotImplementedError
+
+    def compare_start(self, system: object, state: object, other: object) -> None:
+        """Compare rigidmd with the engine of a program at the start. Raises EngineError."""
+        raise NotImplementedError

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple, TypedDict, TypeVar, Unpack
 
 from rigidmd.commands.streams import progress_bar
-from rigidmd.features.external.programs import engine_options, runnable
+from rigidmd.core.programs import engine_options, runnable
 
 #: Adds an argument to the parser of a command.
 Argument = Callable[[argparse.ArgumentParser], object]

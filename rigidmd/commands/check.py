@@ -46,12 +46,11 @@ def _check(options: Options) -> int:
     else:
         from rigidmd.assemble.build import build
         from rigidmd.assemble.time_step import step_warnings
-        from rigidmd.features.external.engines import check_engine
 
         system = build(scene)
         print(describe_system(system))
-        if scene.engine.is_external:
-            print(check_engine(system))
+        if program := scene.engine.program:
+            print(program.feature.load().describe_engine(system))
         if options.program:
             _print_programs(system)
         if options.profile:

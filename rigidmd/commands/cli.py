@@ -22,8 +22,7 @@ from rigidmd.commands.arguments import COMMANDS
 from rigidmd.commands.streams import checked_streams, open_streams, warn
 from rigidmd.core.plain_text import did_you_mean
 from rigidmd.errors import RigidMDError, RigidMDWarning, SimulationError, Wording, worded_by
-from rigidmd.feature import modules
-from rigidmd.features import FEATURES
+from rigidmd.features import FEATURES, modules
 
 EXAMPLES = """examples:
   rigidmd new water                         copy a scene to start from: water.toml
@@ -141,6 +140,9 @@ def _parse(words: list[str]) -> argparse.Namespace:
     parser, commands = _parser(words[0] if words else "")
     name = next((word for word in words if not word.startswith("-")), None)
     if name is not None and name not in commands:
+        for row in FEATURES:
+            if name in row.commands:
+                raise row.missing(f"rigidmd {name}")
         suggestion = did_you_mean(name, commands) or ". `rigidmd --help` lists them"
         parser.error(f"unknown command {name!r}{suggestion}")
     options, unknown = parser.parse_known_args(words)
@@ -165,7 +167,7 @@ def _parser(first: str = "") -> tuple[argparse.ArgumentParser, dict[str, argpars
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     names = {m.name: f"{package.__name__}.{m.name}" for m in iter_modules(package.__path__)}
-    names |= modules(FEATURES, "commands")
+    names |= modules("commands")
     for name in [names[first]] if first in names else names.values():
         import_module(name)
     for name, command in sorted(COMMANDS.items(), key=lambda item: item[1].position):

@@ -50,12 +50,9 @@ from rigidmd.errors import MoleculeError
     flag("--force", help="replace that file"),
 )
 def _models(options: Options) -> int:
+    from rigidmd.assemble.model_text import models_table, molecule_text
     from rigidmd.assemble.plausibility import molecule_warnings
-    from rigidmd.features.view.molecule_figure import (
-        models_table,
-        molecule_text,
-        write_molecule_figure,
-    )
+    from rigidmd.features import provider
     from rigidmd.scene.models import available_models, load_model, read_molecule
 
     if options.geometry is not None:
@@ -83,7 +80,7 @@ def _models(options: Options) -> int:
         print(molecule_text(molecule))
         return 0
     path = Path(options.output or f"{Path(options.model).stem}.png")
-    write_molecule_figure(path, molecule, force=options.force)
+    provider("draw_model", "--draw").draw_model(path, molecule, force=options.force)
     print(f"{molecule.name} is drawn in {path}")
     return 0
 

@@ -1,5 +1,7 @@
 """The list of features, in names and words: importing it loads none of them."""
 
+from collections.abc import Iterator
+
 from rigidmd.feature import Row
 
 FEATURES = (
@@ -13,6 +15,7 @@ FEATURES = (
         "export to LAMMPS, OpenMM and GROMACS, and runs with them",
         needs=("crystals", "potentials"),
         commands=("export", "verify"),
+        programs=("gromacs", "lammps", "openmm"),
     ),
     Row("potentials", "interactions of users: formula, table, Python function"),
     Row(
@@ -48,5 +51,38 @@ FEATURES = (
         needs=("analysis", "bodies", "potentials"),
         commands=("film", "gallery", "report", "view"),
         display="notebook",
+        keys=("output.figures",),
+        provides=("draw_model",),
     ),
 )
+
+
+def modules(kind: str) -> Iterator[tuple[str, str]]:
+    """(name, full name) of the modules of installed features that add "commands", "formats" or
+    "analyses"."""
+    for row in FEATURES:
+        if getattr(row, kind) and row.is_installed:
+            folder = f"{row.package}.commands" if kind == "commands" else row.package
+            yield from ((name, f"{folder}.{name}") for name in getattr(row, kind))
+
+
+def used_by(scene: object) -> Iterator[Row]:
+    """The features that a scene uses: those with a key that has a value in it."""
+    for row in FEATURES:
+        if any(_has(scene, *key.partition("=")[::2]) for key in row.keys):
+            yield row
+
+
+def _has(value: object, path: str, wanted: str) -> bool:
+    """Whether a value has another value at a dotted path, or the one wanted."""
+    if isinstance(value, list | tuple):
+        return any(_has(entry, path, wanted) for entry in value)
+    if path:
+        first, _, rest = path.partition(".")
+        return _has(getattr(value, first, None), rest, wanted)
+    return str(value) == wanted if wanted else bool(value)
+
+
+def provider(method: str, needed_by: str):
+    """The `Feature` that provides a method. Raises MissingFeatureError."""
+    return next(row for row in FEATURES if method in row.provides).load(needed_by)

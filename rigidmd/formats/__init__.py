@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
-from rigidmd.feature import modules
-from rigidmd.features import FEATURES
+from rigidmd.features import modules
 from rigidmd.formats.atoms import Atoms, Frame
 from rigidmd.formats.systems import System
 
@@ -132,7 +131,7 @@ def register(form: Format) -> None:
 def find_modules() -> None:
     """Import the modules of this package and of features, which register their formats."""
     names = {module.name: f"{__name__}.{module.name}" for module in iter_modules(__path__)}
-    names |= modules(FEATURES, "formats")
+    names |= modules("formats")
     for _, name in sorted(names.items()):
         import_module(name)
 

@@ -23,7 +23,8 @@ from rigidmd.engines.observables import Observation, describe_quantities, observ
 from rigidmd.engines.protocol import Engine, NotFiniteError
 from rigidmd.engines.samples import OF_TRAJECTORIES, Samples
 from rigidmd.engines.system import System
-from rigidmd.errors import EngineError, SceneError, SimulationError, StructureError
+from rigidmd.errors import SceneError, SimulationError, StructureError
+from rigidmd.features import used_by
 from rigidmd.features.potentials.user_code.binding import user_errors_explained
 from rigidmd.features.potentials.user_code.compiled import check_compiled_code
 from rigidmd.formats import format_of
@@ -42,7 +43,7 @@ from rigidmd.run.minimise import (
     remove_overlaps,
 )
 from rigidmd.run.molecular_observers import FinalState, LogFile, PressureTensor, Sampler, StepWatch
-from rigidmd.run.observers import Figures, Frames, Moment, Observer, SceneFile
+from rigidmd.run.observers import Frames, Moment, Observer, SceneFile
 from rigidmd.run.part import RunPart
 from rigidmd.run.report import summary_text
 from rigidmd.run.resume import Count, RunRecord, check_same_scene, plain, state_from
@@ -160,31 +161,15 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
 
     def prepare(self) -> None:
         """Remove overlaps, and compile the steps, or compare the start with an external engine."""
-        if self.scene.engine.is_external:
-            from rigidmd.features.external.engines import (
-                compare_at,
-                describe_comparison,
-                external_engine,
-            )
-
+        if program := self.scene.engine.program:
+            feature = program.feature.load()
             # first: the error of a missing program comes before compilation
-            other = external_engine(self.system)
+            other = feature.engine(self.system, 0)
             try:
                 self._remove_overlaps()
-                lines = compare_at(
-                    self.system,
-                    self.state,
-                    self.system.engine_of(self.system.terms, "double"),
-                    other,
-                )
+                feature.compare_start(self.system, self.state, other)
             finally:
                 other.close()
-            if not all(line.agrees for line in lines):
-                title = self.scene.engine.name
-                table = describe_comparison(lines, title)
-                raise EngineError(
-                    f"{self.scene.source}: {title} and rigidmd do not agree at the start\n{table}"
-                )
         else:
             self._remove_overlaps()
             with user_errors_explained(self.system):
@@ -276,11 +261,10 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
 
     def _engine_of(self, k: int) -> Engine:
         """The engine of stage k. Minimisations are always by rigidmd."""
-        if not self.scene.engine.is_external or self.scene.stages[k].is_minimisation:
+        program = self.scene.engine.program
+        if program is None or self.scene.stages[k].is_minimisation:
             return self.system.engine()
-        from rigidmd.features.external.engines import external_engine
-
-        other = external_engine(self.system, k)
+        other = program.feature.load().engine(self.system, k)
         self.engine_version = other.version
         return other
 
@@ -532,7 +516,8 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
                 LogFile(interval, tensor=output.pressure_tensor),
                 FinalState(),
             ]
-            files += [Figures(["energy"], ["png"])] if output.figures else []
+            for row in used_by(self.scene):
+                files += row.load().observers(self.system) if row.is_installed else []
         return [*files, self._sampler, *watch]
 
     def samples(self) -> Samples:

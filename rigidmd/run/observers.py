@@ -254,29 +254,6 @@ class SceneFile(Observer):
         results.files.append(run.path(SCENE))
 
 
-class Figures(Observer):
-    """Figures of the run, by the stems and the types of their files."""
-
-    draws = True
-
-    def __init__(self, stems: Sequence[str], suffixes: Sequence[str]):
-        self._suffixes = suffixes
-        self._names = [f"{stem}.{suffix}" for stem in stems for suffix in suffixes]
-
-    def end(self, run: "Simulation", results: "Results") -> None:
-        from rigidmd.features.view.figures.run import run_figures
-        from rigidmd.features.view.figures.style import save_files
-
-        failed = None
-        for stem, figure in run_figures(run.system, results.samples, results.summary).items():
-            try:
-                results.files += save_files(figure, run.path(stem), self._suffixes)
-            except Exception as error:  # of many types; the other figures are drawn first
-                failed = failed or error
-        if failed is not None:
-            raise failed
-
-
 class OpenTrajectory(OpenFile, Protocol):
     def write(self, state: State, time: float, step: int) -> None: ...
 

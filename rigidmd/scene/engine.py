@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field, create_model
 
+from rigidmd.core.programs import Program, engine_options, runnable
 from rigidmd.core.toml import Json
-from rigidmd.features.external.programs import Program, engine_options, runnable
 from rigidmd.scene.validation import Count, Section
 
 RIGIDMD = "rigidmd"

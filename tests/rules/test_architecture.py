@@ -141,7 +141,6 @@ REACHING_UP = (
     "assemble/scenes.py",
     "commands/arguments.py",
     "commands/check.py",
-    "commands/models.py",
     "dynamics/step_loop.py",
     "engines/cpu/compiled.py",
     "engines/cpu/engine.py",
@@ -151,7 +150,6 @@ REACHING_UP = (
     "io/trajectory_file.py",
     "run/checks.py",
     "run/molecular.py",
-    "run/observers.py",
     "run/part.py",
     "run/pilot/sampling.py",
     "run/pilot/stages.py",
@@ -160,7 +158,6 @@ REACHING_UP = (
     "run/simulation.py",
     "run/stable_step.py",
     "run/trial_systems.py",
-    "scene/engine.py",
 )
 
 
@@ -266,7 +263,7 @@ NAMED_EXTENSIONS = {
     "commands/models.py": "an example in --help",
     "features/external/gromacs/files.py": "the files of an export and a command of GROMACS",
     "features/external/lammps/files.py": "the files of an export, and commands of LAMMPS",
-    "features/external/programs/lammps.py": "the command that runs an export",
+    "features/external/lammps/program.py": "the command that runs an export",
     "features/external/openmm/files.py": "the files of an export, and its script",
     "io/ase_plugin.py": "names of files that ASE cannot read, which it matches without loading the formats",
 }

@@ -48,7 +48,7 @@ TESTED_BY = {
     "features/crystals/test_cif.py": "features/crystals/cif_syntax features/crystals/crystal",
     "features/external/test_lammps.py": "features/external/commands/export features/external/commands/verify features/external/engines"
     " features/external/rigid_bodies features/external/verify",
-    "features/external/test_settings.py": "features/external/force_field",
+    "features/external/test_settings.py": "core/programs features/external/feature features/external/force_field",
     "features/free_energy/test_coupling.py": "features/free_energy/keys features/free_energy/estimate features/free_energy/soft_core"
     " features/free_energy/lambda_sweep",
     "features/free_energy/test_insertion.py": "features/free_energy/guest features/free_energy/guest_pairs"
@@ -73,7 +73,7 @@ TESTED_BY = {
     "features/studies/test_normal_modes.py": "features/studies/commands/modes features/studies/gamma_point",
     "features/view/test_animation.py": "features/view/commands/film features/view/commands/gallery features/view/commands/view"
     " features/bodies/animation features/view/molecule_animation features/view/page features/view/solids",
-    "features/view/test_figures.py": "features/analysis/curve_figure features/bodies/figures features/view/figures/panels"
+    "features/view/test_figures.py": "features/view/feature features/analysis/curve_figure features/bodies/figures features/view/figures/panels"
     " features/view/figures/picture features/view/figures/space features/view/figures/style",
     "features/view/test_notebook.py": "features/analysis/result core/display features/view/plots",
     "features/view/test_run_page.py": "features/view/commands/report",
@@ -94,7 +94,7 @@ TESTED_BY = {
     "run/test_summary.py": "run/report run/short_report",
     "scene/test_hints.py": "scene/base scene/stage",
     "scene/test_validation.py": "errors feature",
-    "scene/test_molecules.py": "commands/models formats/bonds io/scene_file",
+    "scene/test_molecules.py": "assemble/model_text commands/models formats/bonds io/scene_file",
     "support/test_tiers.py": "core/bound_process",
 }
 #: Test files whose name is neither that of a module nor that of a package -> what they test.

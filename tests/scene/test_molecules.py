@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from rigidmd.assemble.build import build
+from rigidmd.assemble.model_text import models_table
 from rigidmd.commands.cli import main
-from rigidmd.features.view.molecule_figure import models_table
 from rigidmd.io.scene_file import write_scene
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene

@@ -318,7 +318,7 @@ TIERS = {
             "a_smooth_cutoff_leaves_every_scheme_its_order_in_the_liquid[chin_4a*",
         ),
         "core/test_integrators.py": ("adding_an_integrator_*",),
-        "features/external/test_settings.py": ("adding_an_engine_takes_a_folder_and_a_file",),
+        "features/external/test_settings.py": ("adding_an_engine_takes_a_folder",),
         "end_to_end/test_faults.py": ("a_run_that_is_stopped_by_signals_continues*",),
         "forces/fields/test_fields.py": ("adding_a_field_*",),
         "forces/neighbors/test_update.py": (

@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike
 
 from rigidmd.core.files import unreadable_reason
 from rigidmd.errors import OutputError
-from rigidmd.feature import modules
-from rigidmd.features import FEATURES
+from rigidmd.features import modules
 from rigidmd.features.analysis.conditions import Condition, check_conditions, trajectory
 from rigidmd.features.analysis.options import check_value, options_of
 from rigidmd.features.analysis.result import (
@@ -97,7 +96,7 @@ def load_built_in() -> None:
     from rigidmd.features.analysis import built_in as folder
 
     names = {m.name: f"{folder.__name__}.{m.name}" for m in iter_modules(folder.__path__)}
-    names |= modules(FEATURES, "analyses")
+    names |= modules("analyses")
     for _, name in sorted(names.items()):
         import_module(name)
 

@@ -27,7 +27,7 @@ from rigidmd.io.folder import MOTION, MOTION_NPZ
 from rigidmd.io.write import write_columns, write_npz
 from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.run.failed_check import MIN_INERTIA_FRACTION, ROUNDING, FailedCheck
-from rigidmd.run.observers import Figures, Frames, Moment, Observer, SceneFile
+from rigidmd.run.observers import Frames, Moment, Observer, SceneFile
 from rigidmd.run.part import RunPart
 from rigidmd.run.report import body_summary_text
 from rigidmd.run.resume import Arrays, NotNegative, RunRecord, check_same_scene, state_from
@@ -385,6 +385,7 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
     @staticmethod
     def _figures() -> list[Observer]:
         from rigidmd.features.bodies.figures import FIGURES  # for runs with figures only
+        from rigidmd.features.view.figures.run import Figures
 
         return [Figures(FIGURES, ("png", "svg"))]
 

@@ -14,18 +14,18 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 
 from rigidmd.core.integrators import Scheme, Solver
+from rigidmd.core.programs import Program
 from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.engines.observables import kinetic_energies, observe
 from rigidmd.engines.protocol import Engine, keep_time
 from rigidmd.engines.system import System
-from rigidmd.errors import EngineError, SceneError
+from rigidmd.errors import SceneError
 from rigidmd.features.external.force_field import (
     ForceFieldView,
     force_field_of,
     tail_of_formulas,
     unknown_terms,
 )
-from rigidmd.features.external.programs import Program
 from rigidmd.features.potentials.poses.potential import BodyPairPotential
 from rigidmd.scene.stage import Stage
 from rigidmd.scene.validation import not_none
@@ -195,25 +195,15 @@ def same_state(one: State | None, other: State) -> bool:
 def external_engine(system: System, stage: int = 0) -> ExternalEngine:
     """The external engine for a stage. Raises SceneError with all that it lacks. EngineError if not
     installed."""
-    program = _supporting_program(system)
+    program = supporting_program(system)
     return program.load(program.engine)(system, stage, **system.scene.engine.options)
 
 
-def _supporting_program(system: System) -> Program:
+def supporting_program(system: System) -> Program:
     """The external engine of a scene. Raises SceneError with all features that it lacks."""
     program = not_none(system.scene.engine.program)
     checked_view(system, program, f"engine.name = {program.name!r}")
     return program
-
-
-def check_engine(system: System) -> str:
-    """What is installed of the external engine of a scene. Raises SceneError with all features that
-    it lacks."""
-    program = _supporting_program(system)
-    try:
-        return program.load(program.installed)() if program.installed else ""
-    except EngineError as error:
-        return str(error)
 
 
 # Comparison with rigidmd at one state, term by term, for `rigidmd verify` and before runs on

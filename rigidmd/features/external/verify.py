@@ -13,6 +13,7 @@ import numpy as np
 from rigidmd.assemble.build import build
 from rigidmd.core.files import writing
 from rigidmd.core.integrators import SCHEMES
+from rigidmd.core.programs import programs, runnable
 from rigidmd.core.state import NOW, State
 from rigidmd.core.toml import Json
 from rigidmd.engines.protocol import Engine
@@ -27,7 +28,6 @@ from rigidmd.features.external.engines import (
     describe_comparison,
     external_engine,
 )
-from rigidmd.features.external.programs import programs, runnable
 from rigidmd.io.folder import SCENE, check_folder, check_names, write_marker, written_by_runs
 from rigidmd.io.scene_file import input_names, write_scene
 from rigidmd.run import Simulation

@@ -21,6 +21,7 @@ from support.common import ROOT, shaken, small_scene
 
 from rigidmd.assemble.build import build
 from rigidmd.assemble.time_step import MIXED_ERROR
+from rigidmd.core.programs import programs
 from rigidmd.errors import SceneError
 from rigidmd.features.external.force_field import force_field_of
 from rigidmd.features.external.gromacs.files import write_gromacs
@@ -28,7 +29,6 @@ from rigidmd.features.external.lammps import files
 from rigidmd.features.external.openmm import engine
 from rigidmd.features.external.openmm.files import write_openmm
 from rigidmd.features.external.openmm.system import Group, integration_groups
-from rigidmd.features.external.programs import programs
 
 COUNTS = {"spce": 6, "nitrogen": 4}
 NVT = {"ensemble": "nvt", "temperature_K": 310.0, "duration_ps": 0.4, "timestep_fs": 2.0}
@@ -486,7 +486,7 @@ def test_the_error_of_mixed_precision_is_the_one_in_the_manual():
 # a new engine
 
 OPTIONS = """
-from rigidmd.features.external.programs import Option, Program
+from rigidmd.core.programs import Option, Program
 
 PROGRAM = Program(
     "Mirror", "it needs nothing", "mirror:TABLE", engine="mirror:MirrorEngine", installed="mirror:installed",
@@ -543,18 +543,16 @@ class MirrorEngine(ExternalEngine):
 SCRIPT = """
 import contextlib, io, json, sys
 
-import rigidmd.engines
-import rigidmd.features.external.programs
+import rigidmd.features.external
 
-rigidmd.engines.__path__.append(sys.argv[1] + "/engines")
-rigidmd.features.external.programs.__path__.append(sys.argv[1] + "/programs")
+rigidmd.features.external.__path__.append(sys.argv[1] + "/engines")
 
 from rigidmd.commands import cli
 
 results = []
 for error, arguments in json.load(sys.stdin):
     if error:
-        from rigidmd.engines.mirror.mirror import MirrorEngine
+        from rigidmd.features.external.mirror.mirror import MirrorEngine
 
         MirrorEngine.error = error
     out, err = io.StringIO(), io.StringIO()
@@ -568,13 +566,12 @@ print(json.dumps(results))
 """
 
 
-def test_adding_an_engine_takes_a_folder_and_a_file(tmp_path):
-    folder, programs = tmp_path / "engines" / "mirror", tmp_path / "programs"
+def test_adding_an_engine_takes_a_folder(tmp_path):
+    folder = tmp_path / "engines" / "mirror"
     folder.mkdir(parents=True)
-    programs.mkdir()
     (folder / "__init__.py").touch()
     (folder / "mirror.py").write_text(MIRROR)
-    (programs / "mirror.py").write_text(OPTIONS)
+    (folder / "program.py").write_text(OPTIONS)
     (tmp_path / "script.py").write_text(SCRIPT)
     scene = tmp_path / "argon.toml"
     scene.write_text(

@@ -4,7 +4,7 @@ import shlex
 from pathlib import Path
 
 from rigidmd.commands.arguments import SCENE, Options, command, output_folder, read_scene
-from rigidmd.features.external.programs import programs
+from rigidmd.core.programs import programs
 
 
 @command(

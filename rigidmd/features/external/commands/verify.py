@@ -5,7 +5,7 @@ import json
 
 from rigidmd.commands import FAILED
 from rigidmd.commands.arguments import SCENE, Options, add_engine, command, flag, read_scene
-from rigidmd.features.external.programs import runnable
+from rigidmd.core.programs import runnable
 
 
 def _engine(parser: argparse.ArgumentParser) -> None:

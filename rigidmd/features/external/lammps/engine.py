@@ -29,7 +29,7 @@ from rigidmd.features.crystals.lammps import dump_box
 from rigidmd.features.external.engines import ExternalEngine, same_state
 from rigidmd.features.external.lammps import files
 from rigidmd.features.external.lammps.ellipsoids import atoms, ellipsoids
-from rigidmd.features.external.programs.lammps import PROGRAM
+from rigidmd.features.external.lammps.program import PROGRAM
 from rigidmd.features.external.rigid_bodies import RigidBodies
 from rigidmd.forces.ewald.corrections import background, self_energy
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb

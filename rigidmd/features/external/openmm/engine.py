@@ -15,6 +15,7 @@ from rigidmd.engines.protocol import NotFiniteError, Tally
 from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SimulationError
 from rigidmd.features.external.engines import ExternalEngine, same_state
+from rigidmd.features.external.openmm.program import FIXED_PRECISIONS, PLATFORMS, precision_of
 from rigidmd.features.external.openmm.system import (
     NM,
     TOLERANCES,
@@ -27,7 +28,6 @@ from rigidmd.features.external.openmm.system import (
     openmm_system,
     step,
 )
-from rigidmd.features.external.programs.openmm import FIXED_PRECISIONS, PLATFORMS, precision_of
 from rigidmd.forces.ewald.corrections import background, intramolecular_energy, self_energy
 from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
 from rigidmd.units import COULOMB_CHARGE, KJ_PER_MOL

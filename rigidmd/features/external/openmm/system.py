@@ -22,7 +22,7 @@ from rigidmd.features.external.force_field import (
     coulomb_formula,
     lennard_jones_formula,
 )
-from rigidmd.features.external.programs.openmm import PROGRAM
+from rigidmd.features.external.openmm.program import PROGRAM
 from rigidmd.features.external.rigid_bodies import MassPoints, Points, RigidBodies, mass_points
 from rigidmd.forces.ewald.errors import charges_in, pme_grid_for, real_error
 from rigidmd.forces.ewald.pme import Pme

@@ -1,5 +1,6 @@
 """The figures of a run: energy.png of molecules, and the figures of a single body."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -10,17 +11,41 @@ from rigidmd.engines.samples import SampleTable, moving
 from rigidmd.features.bodies.figures import body_figures
 from rigidmd.features.bodies.motion import Motion
 from rigidmd.features.bodies.system import BodySystem
+from rigidmd.features.view.figures import style
 from rigidmd.features.view.figures.panels import Panel, Timeline, stack, timeline
+from rigidmd.run.observers import Observer
 
 if TYPE_CHECKING:
     from rigidmd.engines.system import System
     from rigidmd.features.view.figures.picture import Picture
+    from rigidmd.run.results import Results
+    from rigidmd.run.simulation import Simulation
 
 #: Columns of the samples in energy.png.
 DRAWN = ("time", "stage", "drift", "potential", "kinetic")
 TEMPERATURES = ("temperature_translation", "temperature_rotation")
 #: Most stages whose drift is drawn, the last ones.
 MOST_DRIFTS = 4
+
+
+class Figures(Observer):
+    """Figures of the run, by the stems and the types of their files."""
+
+    draws = True
+
+    def __init__(self, stems: Sequence[str], suffixes: Sequence[str]):
+        self._suffixes = suffixes
+        self._names = [f"{stem}.{suffix}" for stem in stems for suffix in suffixes]
+
+    def end(self, run: "Simulation", results: "Results") -> None:
+        failed = None
+        for stem, figure in run_figures(run.system, results.samples, results.summary).items():
+            try:
+                results.files += style.save_files(figure, run.path(stem), self._suffixes)
+            except Exception as error:  # of many types; the other figures are drawn first
+                failed = failed or error
+        if failed is not None:
+            raise failed
 
 
 def run_figures(

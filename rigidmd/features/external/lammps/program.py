@@ -1,6 +1,6 @@
 """LAMMPS for scenes and commands, which do not load it."""
 
-from rigidmd.features.external.programs import Option, Program
+from rigidmd.core.programs import Option, Program
 
 PROGRAM = Program(
     "LAMMPS",

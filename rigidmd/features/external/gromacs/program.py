@@ -1,6 +1,6 @@
 """GROMACS for commands, which do not load its export."""
 
-from rigidmd.features.external.programs import Program
+from rigidmd.core.programs import Program
 
 PROGRAM = Program(
     "GROMACS",

@@ -1,14 +1,19 @@
 """Other programs that can move the molecules: what scenes, commands and reports know of them
 without loading them.
 
-`programs/NAME.py` has a record PROGRAM for each, and its engine is the folder `engines/NAME/`.
+A feature with programs has a folder for each, which is found by its module `program` with the
+record PROGRAM.
 """
 
 from collections.abc import Callable, Mapping
 from functools import cache
 from importlib import import_module
+from importlib.util import find_spec
 from pkgutil import iter_modules
-from typing import Any, NamedTuple
+from typing import NamedTuple
+
+from rigidmd.feature import Row
+from rigidmd.features import FEATURES
 
 
 class Option(NamedTuple):
@@ -20,12 +25,12 @@ class Option(NamedTuple):
 
 
 class Program(NamedTuple):
-    """A program. Objects of the folder of its engine are named as "module:object"."""
+    """A program. The feature that has it reads the texts "module:object" of its folder."""
 
     title: str
     install: str  # how to install it
-    translations: str  # its `engines.external.Translations`
-    engine: str = ""  # its subclass of `engines.external.ExternalEngine`; empty if it cannot be run
+    translations: str  # its `Translations`
+    engine: str = ""  # its subclass of `ExternalEngine`; empty if it cannot be run
     installed: str = ""  # a function that describes what is installed here
     options: Mapping[str, Option] = {}
     describe: Callable[..., str] = lambda **options: ""  # name and options for reports
@@ -39,21 +44,28 @@ class Program(NamedTuple):
         ""  # its function (folder, view, state) -> names of files; empty without an export
     )
     command: str = ""  # that runs an exported folder
-    name: str = ""  # in scenes and commands, and of its folder; set by `programs`
+    # set by `programs`
+    name: str = ""  # in scenes and commands, and of its folder
+    feature: Row = FEATURES[0]  # that has it
 
-    def load(self, path: str) -> Any:
+    def load(self, path: str):
         """An object of its folder."""
         module, _, name = path.partition(":")
-        return getattr(import_module(f"rigidmd.features.external.{self.name}.{module}"), name)
+        return getattr(self.feature.module(f"{self.name}.{module}"), name)
 
 
 @cache
 def programs() -> dict[str, Program]:
     """Name of a program -> its record."""
-    return {
-        module.name: import_module(f"{__name__}.{module.name}").PROGRAM._replace(name=module.name)
-        for module in iter_modules(__path__)
-    }
+    found = {}
+    for row in FEATURES:
+        if row.programs and row.is_installed:
+            for folder in iter_modules(import_module(row.package).__path__):
+                path = f"{row.package}.{folder.name}.program"
+                if folder.ispkg and find_spec(path):
+                    record = import_module(path).PROGRAM
+                    found[folder.name] = record._replace(name=folder.name, feature=row)
+    return found
 
 
 def runnable() -> dict[str, Program]:

@@ -1,6 +1,6 @@
 """OpenMM for scenes and commands, which do not load it."""
 
-from rigidmd.features.external.programs import Option, Program
+from rigidmd.core.programs import Option, Program
 
 #: Platforms with a precision of their own, and that precision. CPU computes forces in single
 #: precision, and moves in double. All others are GPUs, which have the property Precision.
