@@ -39,6 +39,8 @@ class Row:
     formats: tuple[str, ...] = ()  # modules that register file formats
     analyses: tuple[str, ...] = ()  # modules that register analyses
     programs: tuple[str, ...] = ()  # folders with a program, see `core.programs`
+    thermostats: tuple[str, ...] = ()  # modules with a METHOD, see `scene.ensemble_methods`
+    barostats: tuple[str, ...] = ()  # the same
     display: str = ""  # the module that registers functions of `core.display`
 
     @property

@@ -7,7 +7,7 @@ The integrator of a stage: its scheme with the flows of the thermostat and the b
 from dataclasses import replace
 from importlib import import_module
 from math import inf
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 from rigidmd.assemble.defaults import with_momentum_removal
 from rigidmd.assemble.memory_check import check_memory
@@ -16,10 +16,10 @@ from rigidmd.assemble.stage_description import stage_notes
 from rigidmd.assemble.start import Configuration, overlaps, set_momenta
 from rigidmd.assemble.time_step import with_precision
 from rigidmd.core.integrators import Scheme
+from rigidmd.dynamics import noise
 from rigidmd.dynamics.barostats import Confinement, Pressure
 from rigidmd.dynamics.model import Model, conserved_momentum, count_degrees_of_freedom, mobile
-from rigidmd.dynamics.noise import BAROSTAT, THERMOSTAT, key_of
-from rigidmd.dynamics.thermostats import Ramp
+from rigidmd.dynamics.thermostats import Ramp, UserThermostat
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, StructureError
 from rigidmd.features.free_energy.coupling import at_lambda, coupled
@@ -27,7 +27,8 @@ from rigidmd.forces.neighbors.space import Space
 from rigidmd.forces.parts import Interactions, SystemParts, sum_of_tails
 from rigidmd.forces.terms import trait
 from rigidmd.mechanics.free_rotor import NoRotor
-from rigidmd.scene import MolecularScene, couplings
+from rigidmd.scene import MolecularScene
+from rigidmd.scene.ensembles import BAROSTATS, THERMOSTATS
 from rigidmd.scene.fields import FIELDS, field_notes
 from rigidmd.scene.forces import ELECTROSTATICS, POTENTIALS
 from rigidmd.scene.molecules import missing_user_code
@@ -283,20 +284,14 @@ def integrator_of_stage(system: System, k: int) -> Scheme:
     stage = system.scene.stages[k]
     scheme = stage.scheme
     if system.thermostat is not None:
-        if (thermostat := system.user_thermostat(k)) is not None:
-            scheme = scheme.with_thermostat(thermostat, halved=thermostat.halved)
-    elif stage.is_hybrid:
-        scheme = scheme.with_trajectories(thermostat_of(system, k), stage.steps_together)
+        if (user := system.user_thermostat(k)) is not None:
+            scheme = scheme.with_thermostat(user, halved=cast("UserThermostat", user).halved)
     elif stage.has_thermostat:
-        halved = couplings.THERMOSTATS[stage.thermostat_kind].halved
-        scheme = scheme.with_thermostat(thermostat_of(system, k), halved=halved)
+        kind = THERMOSTATS[stage.thermostat_kind]
+        scheme = kind.joined(scheme, thermostat_of(system, k), stage)
     if stage.has_barostat:
-        barostat = barostat_of(system, k)
-        in_steps = couplings.BAROSTATS[stage.barostat_kind].in_verlet_steps
-        if in_steps:
-            scheme = scheme.with_piston(barostat)
-        else:
-            scheme = scheme.with_barostat(barostat, stage.moves_every)
+        kind = BAROSTATS[stage.barostat_kind]
+        scheme = kind.joined(scheme, barostat_of(system, k), stage)
     if system.keeps_momentum_in(k) and (interval := system.removes_momentum_every) is not None:
         scheme = scheme.with_momentum_removal(stage.steps_of(interval))
     return scheme
@@ -305,14 +300,14 @@ def integrator_of_stage(system: System, k: int) -> Scheme:
 def thermostat_of(system: System, k: int) -> NamedTuple:
     stage = system.scene.stages[k]
     thermal = _thermal(stage)
-    key = key_of(system.scene.seed, THERMOSTAT, k)
-    module = import_module(f"rigidmd.dynamics.thermostats.{stage.thermostat_kind}")
+    key = noise.key_of(system.scene.seed, noise.THERMOSTAT, k)
+    module = import_module(THERMOSTATS[stage.thermostat_kind].flow)
     return module.thermostat(stage, thermal, system.freedom_in(k), key)
 
 
 def barostat_of(system: System, k: int) -> NamedTuple:
     stage = system.scene.stages[k]
-    key = key_of(system.scene.seed, BAROSTAT, k)
+    key = noise.key_of(system.scene.seed, noise.BAROSTAT, k)
     # the scene lists xy, xz, yz: components (1, 0), (2, 0), (2, 1) of the lower triangle
     first, last = (tuple(x * BAR for x in ends) for ends in stage.pressures)
     pressure = Pressure(first, last, float(stage.steps))  # pyright: ignore[reportArgumentType]
@@ -327,7 +322,7 @@ def barostat_of(system: System, k: int) -> NamedTuple:
         (0.0, 0.0) if system.tail is None else system.tail[:2],
         key,
     )
-    module = import_module(f"rigidmd.dynamics.barostats.{stage.barostat_kind}")
+    module = import_module(BAROSTATS[stage.barostat_kind].flow)
     return module.barostat(stage, confinement)
 
 

@@ -1,7 +1,7 @@
 """Descriptions of stages: steps, thermostat and barostat, sampled distribution, conserved
 quantities."""
 
-from rigidmd.scene.couplings import BAROSTATS, COMPRESSIBILITY, THERMOSTATS
+from rigidmd.scene.ensembles import BAROSTATS, COMPRESSIBILITY, THERMOSTATS
 from rigidmd.scene.stage import Stage
 
 #: Range of compressibilities (1/bar): diamond, a gas at 0.01 bar.
@@ -55,9 +55,9 @@ def describe_stage(stage: Stage) -> list[str]:
         choice = f"integrator and step chosen at its start for an error of {error}"
         text = f"{stage.label}: {stage.duration_ps:g} ps, {choice}"
     if stage.has_thermostat:
-        kind = stage.thermostat_kind
-        described = THERMOSTATS[stage.thermostat_kind].description(stage.thermostat_values)
-        text += f", {_ramp(stage.temperatures)} K by {kind.replace('_', ' ')}, {described}"
+        kind = THERMOSTATS[stage.thermostat_kind]
+        described = kind.describe(stage.thermostat_values)
+        text += f", {_ramp(stage.temperatures)} K by {kind.title}, {described}"
     if stage.has_barostat:
         text += f", {_barostat(stage)}"
     if stage.volume:
@@ -74,8 +74,7 @@ def describe_stage(stage: Stage) -> list[str]:
 def _barostat(stage: Stage) -> str:
     kind = BAROSTATS[stage.barostat_kind]
     values = stage.barostat_values
-    title = kind.title or stage.barostat_kind.replace("_", " ")
-    text = f"{_pressure(stage)} bar by {title}, {stage.pressure_coupling.replace('_', '-')}"
+    text = f"{_pressure(stage)} bar by {kind.title}, {stage.pressure_coupling.replace('_', '-')}"
     if "barostat_time_ps" in values:
         text += f", {stage.barostat_time:g} ps"
     if "barostat_interval_ps" in values:

@@ -43,7 +43,7 @@ FEATURES = (
         "CIF and symmetry, and the formats that liquids do not need",
         formats=("cif", "g96", "gsd", "lammps"),
     ),
-    Row("monte_carlo", "hybrid Monte Carlo"),
+    Row("monte_carlo", "hybrid Monte Carlo", thermostats=("keys",)),
     Row("calculators", "ASE calculators, both ways", needs=("potentials",)),
     Row(
         "view",
@@ -58,8 +58,8 @@ FEATURES = (
 
 
 def modules(kind: str) -> Iterator[tuple[str, str]]:
-    """(name, full name) of the modules of installed features that add "commands", "formats" or
-    "analyses"."""
+    """(name, full name) of the modules of installed features that add "commands", "formats",
+    "analyses", "thermostats" or "barostats"."""
     for row in FEATURES:
         if getattr(row, kind) and row.is_installed:
             folder = f"{row.package}.commands" if kind == "commands" else row.package

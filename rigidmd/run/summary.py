@@ -19,7 +19,7 @@ from rigidmd.engines.samples import (
     equilibrated,
 )
 from rigidmd.engines.system import System
-from rigidmd.scene.couplings import THERMOSTATS
+from rigidmd.scene.ensembles import THERMOSTATS
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, BOLTZMANN, COULOMB, FEMTOSECOND, KJ_PER_MOL
 

@@ -13,8 +13,8 @@ from rigidmd.errors import SceneError, option
 from rigidmd.features.free_energy.keys import Coupling
 from rigidmd.formats import BY_EXTENSION, TOPOLOGIES, TOPOLOGY, TRAJECTORY, format_of, written
 from rigidmd.scene.base import Scene, file_name, is_inside
-from rigidmd.scene.couplings import default_interval
 from rigidmd.scene.engine import EngineChoice
+from rigidmd.scene.ensemble_methods import default_interval
 from rigidmd.scene.fields import Fields, field_errors
 from rigidmd.scene.forces import FORCE_FILES, Forces
 from rigidmd.scene.models import SIZES

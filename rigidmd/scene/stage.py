@@ -1,14 +1,14 @@
 """The tables [[stages]] of a scene of molecules: each has one ensemble and one time step, or is a
 minimisation."""
 
-from math import inf, log, pi
+from math import pi
 from typing import Annotated, Literal
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from rigidmd.core.integrators import AUTO, SCHEMES, SOLVERS, WITH_THERMOSTAT, Rotor, auto_errors
-from rigidmd.scene.couplings import (
-    BAROSTAT_TIME,
+from rigidmd.scene.ensemble_methods import BAROSTAT_TIME, EnsembleMethod, Values
+from rigidmd.scene.ensembles import (
     BAROSTATS,
     COMPRESSIBILITY,
     DEFAULT_THERMOSTAT,
@@ -16,7 +16,6 @@ from rigidmd.scene.couplings import (
     BarostatKeys,
     Six,
     ThermostatKeys,
-    Values,
 )
 from rigidmd.scene.integrators import VERLET_ELSEWHERE, MovedByScheme, advise_on_integrator
 from rigidmd.scene.validation import (
@@ -183,7 +182,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         if self.has_barostat and self.pressure_bar is None:
             yield f"an {self.ensemble} stage needs pressure_bar"
         if idle := [key for key in self.idle_keys if self._is_given(key)]:
-            where = self._where([_users(key) for key in idle])
+            where = self._where([self._users(key) for key in idle])
             yield f"{', '.join(idle)} would have no effect {where}"
         if (
             self.integrator in WITH_THERMOSTAT
@@ -235,8 +234,16 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         return [
             key
             for key in type(self).model_fields
-            if (users := _users(key)) and users.isdisjoint(parts)
+            if (users := self._users(key)) and users.isdisjoint(parts)
         ]
+
+    def _users(self, key: str) -> set[str]:
+        """The ensembles, thermostats and barostats that use a key. None for the keys of every
+        stage."""
+        methods = [*THERMOSTATS.values(), *BAROSTATS.values()]
+        return USED.get(key, set()) | {
+            method.name for method in methods if key in method.defaults(self)
+        }
 
     def _is_given(self, key: str) -> bool:
         return getattr(self, key) != type(self).model_fields[key].default
@@ -247,7 +254,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             return "in a minimise stage" + (
                 " without pressure_bar" if all(CELL in names for names in users) else ""
             )
-        kinds = THERMOSTATS | BAROSTATS
+        kinds: dict[str, EnsembleMethod] = {**THERMOSTATS, **BAROSTATS}
         for names in users:
             if not any(
                 self.ensemble in (kinds[name].ensembles if name in kinds else (name,))
@@ -367,13 +374,6 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         return self.has_thermostat and THERMOSTATS[self.thermostat_kind].in_trajectories
 
     @property
-    def refreshment_rate(self) -> float:
-        """The friction (1/ps) that draws the momenta of hybrid Monte Carlo again in one step.
-        Infinite for all of it."""
-        kept_fraction = 1 - self.momentum_refreshment
-        return -log(kept_fraction) / (2 * self.step) if kept_fraction else inf
-
-    @property
     def duration(self) -> float:
         """Duration, ps, 0 for a minimisation."""
         return self.duration_ps or 0.0
@@ -425,8 +425,12 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     @property
     def barostat_kind(self) -> str:
         """The barostat, or an empty text."""
-        allowed = [name for name, kind in BAROSTATS.items() if self.ensemble in kind.ensembles]
-        return (self.barostat or allowed[0]) if allowed else ""
+        defaults = [
+            name
+            for name, kind in BAROSTATS.items()
+            if kind.is_default and self.ensemble in kind.ensembles
+        ]
+        return (self.barostat or defaults[0]) if defaults else ""
 
     @property
     def thermostat_values(self) -> Values:
@@ -450,11 +454,6 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     def thermostat_time(self) -> float:
         """Time constant of the thermostat, ps. The longer one of langevin."""
         return THERMOSTATS[self.thermostat_kind].time(self.thermostat_values)
-
-    @property
-    def frictions(self) -> tuple[float, ...]:
-        """Friction of langevin on translation and rotation, 1/ps."""
-        return tuple(THERMOSTATS["langevin"].values(self).values())
 
     @property
     def pressures(self) -> tuple[Six, Six]:
@@ -489,13 +488,6 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     def keeps_momentum(self) -> bool:
         """Whether the thermostat conserves the total momentum."""
         return not self.has_thermostat or not THERMOSTATS[self.thermostat_kind].on_molecules
-
-
-def _users(key: str) -> set[str]:
-    """The ensembles, thermostats and barostats that use a key. None for the keys of every stage."""
-    return USED.get(key, set()) | {
-        name for name, kind in (THERMOSTATS | BAROSTATS).items() if key in kind.keys
-    }
 
 
 def _tensor(pressure: float | tuple[float, float, float] | Six) -> Six:

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from support.common import built, move, observe, same_bits, small_scene
 
-from rigidmd.assemble.build import barostat_of, build, integrator_of_stage
+from rigidmd.assemble.build import barostat_of, build
 from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
 from rigidmd.core.state import NOW, WORK
 from rigidmd.dynamics import barostats
@@ -436,26 +436,6 @@ def test_the_log_has_the_box_and_the_energy_ledger(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("scene", "message"),
-    [
-        ({"box": {"lengths_A": 30.0, "periodic": False}}, "box.periodic is false"),
-        (
-            {
-                "molecules": [
-                    {"model": "argon", "count": 9},
-                    {"model": "krypton", "count": 9, "frozen": True},
-                ]
-            },
-            "frozen",
-        ),
-    ],
-)
-def test_scenes_without_a_box_to_change(scene, message):
-    with pytest.raises(SceneError, match=message):
-        small_scene({"argon": 20}, 30.0, **({"stages": [NPT]} | scene))
-
-
-@pytest.mark.parametrize(
     "coupled", [NPT, {"ensemble": "nph", "pressure_bar": 1.0, "duration_ps": 0.1}], ids=str
 )
 def test_a_barostat_does_not_go_with_a_field_on_net_charges(coupled):
@@ -514,21 +494,3 @@ def test_a_box_that_becomes_too_small_or_boils_stops_with_a_message():
     )
     with pytest.raises(SimulationError, match="boils"):
         Simulation(boils).run()
-
-
-def test_a_compressibility_in_another_unit_is_reported():
-    scene = small_scene({"argon": 20}, 30.0, stages=[NPT | {"compressibility_per_bar": 4.5e-10}])
-    assert any("another unit" in note for note in build(scene).notes)
-    assert not any(
-        "another unit" in note
-        for note in build(small_scene({"argon": 20}, 30.0, stages=[NPT])).notes
-    )
-
-
-def test_pressures_become_components():
-    stage = NPT | {"pressure_coupling": "flexible", "pressure_bar": [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]}
-    run = {"remove_momentum_interval_ps": False}
-    system = build(small_scene({"argon": 20}, 30.0, stages=[stage], run=run))
-    box = integrator_of_stage(system, 0).barostat
-    assert box.pressure.first == pytest.approx(np.arange(1, 7) * BAR)
-    assert integrator_of_stage(system, 0).flows[-1].every == 25

@@ -11,7 +11,7 @@ TESTS, PACKAGE = ROOT / "tests", ROOT / "rigidmd"
 
 #: Test file -> further modules that it tests.
 TESTED_BY = {
-    "assemble/test_build.py": "assemble/resolve dynamics/flows dynamics/model scene/couplings",
+    "assemble/test_build.py": "assemble/resolve dynamics/flows dynamics/model",
     "assemble/test_defaults.py": "assemble/describe scene/forces",
     "assemble/test_matching.py": "assemble/assignment assemble/atom_kinds assemble/bonded_atoms",
     "commands/test_cli.py": "commands/arguments commands/check commands/compile commands/help"
@@ -54,6 +54,8 @@ TESTED_BY = {
     "features/free_energy/test_insertion.py": "features/free_energy/guest features/free_energy/guest_pairs"
     " features/free_energy/pose_trials",
     "features/free_energy/test_mean_force.py": "features/free_energy/windows",
+    "features/monte_carlo/test_trajectories.py": "features/monte_carlo/keys"
+    " features/monte_carlo/momenta",
     "features/potentials/test_custom.py": "features/potentials/user_code/pair_potential"
     " features/potentials/user_code/pair_terms features/potentials/user_code/cutoffs features/potentials/sites/formulas",
     "features/potentials/test_pose_tables.py": "features/potentials/poses/pairs",
@@ -93,6 +95,7 @@ TESTED_BY = {
     "run/test_simulation.py": "engines/sites engines/system run/loop run/molecular run/part",
     "run/test_summary.py": "run/report run/short_report",
     "scene/test_hints.py": "scene/base scene/stage",
+    "scene/test_thermostats.py": "scene/ensemble_methods scene/ensembles",
     "scene/test_validation.py": "errors feature",
     "scene/test_molecules.py": "assemble/model_text commands/models formats/bonds io/scene_file",
     "support/test_tiers.py": "core/bound_process",

@@ -66,6 +66,15 @@ class Thermostat(Protocol):
         ...
 
 
+class UserThermostat(Thermostat, Protocol):
+    """The record of a user's thermostat."""
+
+    @property
+    def halved(self) -> bool:
+        """As in `scene.ensemble_methods.Thermostat`."""
+        ...
+
+
 def thermostat_code(thermostat: Thermostat | None, model: Model) -> Code:
     """The tasks of a thermostat that act on blocks of molecules."""
     if thermostat is None:

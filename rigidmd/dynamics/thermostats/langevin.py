@@ -39,7 +39,7 @@ class Langevin(NamedTuple):
 
 
 def thermostat(stage: Stage, thermal_energy: Ramp, freedom: DegreesOfFreedom, key: Key) -> Langevin:
-    return Langevin(thermal_energy, *stage.frictions, key)
+    return Langevin(thermal_energy, *stage.thermostat_values.values(), key)
 
 
 implements(apply_thermostat, Langevin)(apply_by_molecule)

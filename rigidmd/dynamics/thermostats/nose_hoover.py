@@ -47,7 +47,7 @@ def thermostat(
     return NoseHoover(
         thermal_energy,
         stage.thermostat_time,
-        stage.nose_hoover_links,
+        int(stage.thermostat_values["nose_hoover_links"]),
         freedom.translation,
         freedom.rotation,
     )

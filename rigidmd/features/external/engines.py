@@ -123,7 +123,7 @@ def moves(title: str, bodies: str) -> tuple[Key, Limit[Stage]]:
         Key("integrator", {"velocity_verlet": "", "baoab": ""}, by),
         Limit(
             f"friction_rotation_per_ps: {title} has one friction for translation and rotation",
-            lambda stage: is_langevin(stage) and len(set(stage.frictions)) > 1,
+            lambda stage: is_langevin(stage) and len(set(stage.thermostat_values.values())) > 1,
         ),
     )
 

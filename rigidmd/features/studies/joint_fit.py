@@ -18,7 +18,7 @@ from rigidmd.engines.system import System
 from rigidmd.features.analysis.rigid_frames import production_samples
 from rigidmd.features.studies.extrapolation import BiasFit, MeanAtStep, extrapolate, means_of_runs
 from rigidmd.run.record import Record
-from rigidmd.scene.couplings import BAROSTATS
+from rigidmd.scene.ensembles import BAROSTATS
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 

@@ -4,6 +4,7 @@ Hamiltonian, see "The bias of averages" in the theory chapter `errors`."""
 
 from dataclasses import replace
 from math import inf, isfinite, sqrt
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -22,6 +23,9 @@ from rigidmd.run.stable_step import stiffest_mode
 from rigidmd.scene.stage import Stage
 from rigidmd.scene.validation import not_none
 from rigidmd.units import BOLTZMANN, FEMTOSECOND
+
+if TYPE_CHECKING:
+    from rigidmd.features.monte_carlo.keys import HybridMonteCarloKeys
 
 #: The integrator for averages, and its largest bias of U, in kT per degree of freedom and in (w
 #: dt)²: one of two parts, which cancel in harmonic motions.
@@ -159,13 +163,14 @@ def choose_for_sampling(system: System, state: State, k: int) -> tuple[Stage, st
             f"stages.{k}: nothing sets a step for integrator = 'auto'. Name an integrator and a"
             " step"
         )
+    steps_set = cast("HybridMonteCarloKeys", stage).trajectory_steps
     best = (0.0, 0.0, stage)
     for integrator in TRIED:
         scheme = stage.with_integrator(integrator, 1.0).scheme
         for fraction in FRACTIONS:
             step = round_down(fraction * stable_angle(scheme) / stiffest.rate / FEMTOSECOND)
             steps = max(1, round(RADIANS / sqrt(rate) / (step * FEMTOSECOND)))
-            decided = with_steps(integrator, step, stage.trajectory_steps or steps)
+            decided = with_steps(integrator, step, steps_set or steps)
             now, chance = _acceptance(system, now, k, decided)
             motion = chance * step / scheme.force_evaluations
             best = max(best, (motion, chance, decided), key=lambda tried: tried[0])
@@ -178,7 +183,7 @@ def choose_for_sampling(system: System, state: State, k: int) -> tuple[Stage, st
         )
     return decided.with_defaults, (
         f"the longest accepted motion per force evaluation of {', '.join(TRIED)}; {chance:.0%}"
-        f" of {TRAJECTORIES} pilot trajectories of {decided.trajectory_steps} steps would be"
+        f" of {TRAJECTORIES} pilot trajectories of {decided.steps_together} steps would be"
         " accepted"
     )
 

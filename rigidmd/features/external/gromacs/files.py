@@ -358,7 +358,7 @@ def _couplings(stage: Stage) -> dict[str, object]:
         "tau-t": f"{stage.thermostat_time:.12g}",
     }
     if stage.thermostat_kind == "nose_hoover":
-        settings["nh-chain-length"] = stage.nose_hoover_links
+        settings["nh-chain-length"] = stage.thermostat_values["nose_hoover_links"]
     if first != last:
         settings |= {
             "annealing": "single",

@@ -399,11 +399,11 @@ def fixes(view: ForceFieldView, k: int) -> list[str]:
     stage = view.system.scene.stages[k]
     seed = (view.system.scene.seed * 1000 + k) % (SEEDS - 1) + 1
     kind = "nve" if stage.is_minimisation else stage.ensemble
-    links = stage.nose_hoover_links
     at = " ".join(map(_num, stage.temperatures))
     langevin = []
     if stage.thermostat_kind == "langevin":
-        damping = f"{at} {_num(1e3 / stage.frictions[0])}"
+        friction = stage.thermostat_values["friction_translation_per_ps"]
+        damping = f"{at} {_num(1e3 / friction)}"
         of_bodies = f"rigid/small molecule langevin {damping} {seed}"
         of_points = "nve"
         langevin = [f"fix {POINTS}_bath {POINTS} langevin {damping} {seed + 1} tally yes"]
@@ -418,6 +418,7 @@ def fixes(view: ForceFieldView, k: int) -> list[str]:
             box = f" {_barostat(view, stage)}"
             of_bodies, of_points = of_bodies + box, of_points + box
         if stage.has_thermostat:
+            links = stage.thermostat_values["nose_hoover_links"]
             of_bodies += f" tparam {links} 1 5" + (f" pchain {links}" if stage.has_barostat else "")
             of_points += "" if stage.has_barostat else f" tchain {links}"
     lines = [f"fix {BODIES} {BODIES} {of_bodies}"] if view.is_body.any() else []

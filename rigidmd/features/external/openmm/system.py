@@ -464,13 +464,14 @@ def integrator_of(view: ForceFieldView, k: int, distance_tolerance: float) -> "o
     stage = view.system.scene.stages[k]
     dt = stage.step
     if stage.thermostat_kind == "langevin":
-        made = mm.LangevinMiddleIntegrator(stage.temperatures[0], stage.frictions[0], dt)
+        friction = stage.thermostat_values["friction_translation_per_ps"]
+        made = mm.LangevinMiddleIntegrator(stage.temperatures[0], friction, dt)
         made.setRandomNumberSeed(_seed(view, k))
     elif stage.thermostat_kind == "nose_hoover":
         # OpenMM has the angular frequency of a chain, a scene its period
         frequency = 2 * pi / stage.thermostat_time
         made = mm.NoseHooverIntegrator(
-            stage.temperatures[0], frequency, dt, stage.nose_hoover_links
+            stage.temperatures[0], frequency, dt, int(stage.thermostat_values["nose_hoover_links"])
         )
     else:
         made = _velocity_verlet(dt)

@@ -69,7 +69,7 @@ def compiled_force(kind: type) -> Callable[[Function], Function]:
     return register
 
 
-class UserThermostat:
+class ThermostatDefaults:
     """Attributes that the class of a user's thermostat may have, with the defaults."""
 
     halved = True
@@ -119,7 +119,7 @@ def compiled_thermostat(kind: type) -> Callable[[Function], Function]:
     _check_class(kind)
     for name in ("halved", "tasks"):
         if not hasattr(kind, name):
-            setattr(kind, name, getattr(UserThermostat, name))
+            setattr(kind, name, getattr(ThermostatDefaults, name))
 
     def register(function: Function) -> Function:
         _check_arguments(function, ("thermostat", "model", "state", "h", "draw"))

@@ -21,7 +21,7 @@ from rigidmd.run.mean_box import scale_to_mean_box
 from rigidmd.run.observers import Every
 from rigidmd.run.stable_step import stiffest_mode
 from rigidmd.scene import BodyScene, MolecularScene
-from rigidmd.scene.couplings import THERMOSTATS
+from rigidmd.scene.ensembles import THERMOSTATS
 from rigidmd.scene.stage import ERROR_TARGETS, MOST_STEPS, Stage
 from rigidmd.scene.validation import did_you_mean
 from rigidmd.units import BAR, BOLTZMANN, FEMTOSECOND, KJ_PER_MOL

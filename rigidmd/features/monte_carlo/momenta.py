@@ -22,7 +22,7 @@ from rigidmd.scene.stage import Stage
 
 
 class HybridMonteCarlo(NamedTuple):
-    """New momenta, in whole or in part, before each trajectory of `dynamics.hybrid_monte_carlo`:
+    """New momenta, in whole or in part, before each trajectory of `monte_carlo.trajectories`:
     the flow of Langevin's thermostat over one step, whose frictions are infinite for wholly new
     momenta."""
 
@@ -39,7 +39,7 @@ class HybridMonteCarlo(NamedTuple):
 def thermostat(
     stage: Stage, thermal_energy: Ramp, freedom: DegreesOfFreedom, key: Key
 ) -> HybridMonteCarlo:
-    kept_fraction = 1 - stage.momentum_refreshment
+    kept_fraction = 1 - stage.thermostat_values["momentum_refreshment"]
     friction = -log(kept_fraction) / (2 * stage.step) if kept_fraction else inf
     return HybridMonteCarlo(thermal_energy, friction, friction, key)
 
