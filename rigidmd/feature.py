@@ -6,6 +6,8 @@ module `feature`, a subclass of `Feature`: the core calls its methods for scenes
 feature may be absent: its folder is not there, and a scene that needs it ends with one sentence.
 """
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
@@ -17,6 +19,7 @@ from typing import TypeVar
 from rigidmd.errors import RigidMDError
 
 Scene = TypeVar("Scene")
+Parts = TypeVar("Parts")
 System = TypeVar("System")
 
 
@@ -34,6 +37,7 @@ class Row:
     #: Keys of scenes that belong to it, such as "forces.custom", or "stages.thermostat=NAME" for
     #: one value. A scene in which one has a value uses the feature
     keys: tuple[str, ...] = ()
+    acts: bool = False  # whether it changes systems: a scene that uses it cannot do without
     provides: tuple[str, ...] = ()  # methods of its `Feature` that commands of the core call
     commands: tuple[str, ...] = ()  # modules of its folder `commands`
     formats: tuple[str, ...] = ()  # modules that register file formats
@@ -69,20 +73,48 @@ class Row:
 
 
 class Feature:
-    """What a feature does. A method that a feature does not have adds nothing."""
+    """What a feature does for scenes of molecules that use it. A method that a feature does not
+    have adds nothing."""
 
-    def resolve(self, scene: Scene) -> Scene:
-        """The scene with the defaults of the feature. Raises SceneError."""
-        return scene
+    def resolve(self, scene: Scene, species: list) -> tuple[Scene, list[str]]:
+        """The scene with the defaults of the feature, and error messages.
 
-    def extend(self, system: System) -> System:
-        """The system of molecules with what the feature adds: terms, `extras`. Raises
-        SceneError."""
+        species : those of [[molecules]] first, then further ones of the structure
+        """
+        return scene, []
+
+    def acting(self, parts: Parts) -> Parts:
+        """The parts of a system as they interact, such as species with other charges."""
+        return parts
+
+    def potentials(self, scene: object) -> dict[str, Callable]:
+        """Pair potentials by keys of [forces], which replace those of the core: functions
+        `interactions` of the parts of a system."""
+        return {}
+
+    def extend(self, system: System, parts: object, *, user_code: bool) -> System:
+        """The system with what the feature adds: terms, notes, `extras`. Raises SceneError.
+
+        parts : of the system, before `acting`
+        user_code : see `assemble.build.build`
+        """
         return system
 
     def observers(self, system: object) -> list:
         """The observers (`run.observers`) that write the files of the feature in a run."""
         return []
+
+    def explained(self, system: object) -> AbstractContextManager:
+        """Errors in a block as errors of the scene, where the system is compiled or observed."""
+        return nullcontext()
+
+    def check_start(self, system: object, state: object) -> list[str]:
+        """Notes on the system at the start of a run. Raises SceneError."""
+        return []
+
+    def warning_at(self, system: object, state: object) -> str:
+        """A warning at a state in a run, which is given once. Empty without one."""
+        return ""
 
     def draw_model(self, path: Path, molecule: object, *, force: bool) -> None:
         """Write a picture of a molecular model."""

@@ -4,7 +4,6 @@ raised together.
 The integrator of a stage: its scheme with the flows of the thermostat and the barostat.
 """
 
-from dataclasses import replace
 from importlib import import_module
 from math import inf
 from typing import NamedTuple, cast
@@ -22,7 +21,7 @@ from rigidmd.dynamics.model import Model, conserved_momentum, count_degrees_of_f
 from rigidmd.dynamics.thermostats import Ramp, UserThermostat
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, StructureError
-from rigidmd.features.free_energy.coupling import at_lambda, coupled
+from rigidmd.features import acting_on
 from rigidmd.forces.neighbors.space import Space
 from rigidmd.forces.parts import Interactions, SystemParts, sum_of_tails
 from rigidmd.forces.terms import trait
@@ -31,7 +30,6 @@ from rigidmd.scene import MolecularScene
 from rigidmd.scene.ensembles import BAROSTATS, THERMOSTATS
 from rigidmd.scene.fields import FIELDS, field_notes
 from rigidmd.scene.forces import ELECTROSTATICS, POTENTIALS
-from rigidmd.scene.molecules import missing_user_code
 from rigidmd.scene.stage import Stage
 from rigidmd.scene.validation import not_none
 from rigidmd.units import BAR, BOLTZMANN
@@ -45,18 +43,13 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
         do not need
     """
     resolved = resolve(scene)
-    system = _system_of(resolved)
-    if user_code:
-        system = _with_user_code(system)
-    elif system.scene.forces.bodies:
-        from rigidmd.features.potentials.user_code.body_pairs import potentials_of_stored_run
-
-        system = replace(system, body_pairs=potentials_of_stored_run(system.scene))
+    parts = parts_as_they_act(resolved.parts)
+    system = _system_of(resolved, parts, acting_in(parts))
+    for feature in acting_on(system.scene):
+        system = feature.extend(system, resolved.parts, user_code=user_code)
     if errors := _ensemble_errors(system):
         raise SceneError(system.scene.source, errors)
     check_memory(system)
-    if system.scene.coupling is not None:
-        system.notes.append(system.scene.coupling.in_short)
     system.notes.extend(system.scene.rounded_times())
     system.notes.extend(set_momenta(system.scene, system.model, system.state, resolved.start))
     system.notes.extend(_system_notes(system))
@@ -64,14 +57,12 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     return system
 
 
-def _system_of(resolved: ResolvedScene) -> System:
-    """The system of a resolved scene without the code of users, at rest. Raises SceneError."""
-    parts = resolved.parts
-    scene = parts.scene
-    acting = acting_in(scene, parts)
-    others = () if scene.coupling is None else scene.coupling.lambdas
-    at = {x: acting_in(at_lambda(scene, x), parts) for x in others}
-    species = coupled(scene, parts.species)
+def _system_of(resolved: ResolvedScene, parts: SystemParts, acting: Interactions) -> System:
+    """The system of a resolved scene with the terms of the core, at rest. Raises SceneError.
+
+    parts : as they act
+    """
+    scene, species = parts.scene, [*parts.species]
     model = resolved.model._replace(keeps_momentum=conserved_momentum(resolved.model, acting.terms))
     scene = with_momentum_removal(scene, model.keeps_momentum)
     free = [m for m, moves in zip(species, parts.moves, strict=True) if moves]
@@ -99,26 +90,9 @@ def _system_of(resolved: ResolvedScene) -> System:
         ),
         precision_reason=precision_reason,
         force_error=acting.force_error,
-        at_lambda=at,
         notes=[*resolved.notes, *acting.notes, *field_notes(scene), *stage_notes(scene.stages)],
         warnings=resolved.warnings,
     )
-
-
-def _with_user_code(system: System) -> System:
-    """The system with the forces and the thermostat of users. Raises SceneError."""
-    scene = system.scene
-    if scene.from_python != scene.user_code.names:
-        raise SceneError(
-            scene.source, [missing_user_code(scene.from_python, scene.user_code.names)]
-        )
-    if not (scene.forces.added or scene.from_python):
-        return system
-    from rigidmd.features.potentials.user_code.binding import (
-        with_user_code,  # for these scenes only
-    )
-
-    return with_user_code(system)
 
 
 def _ensemble_errors(system: System) -> list[str]:
@@ -177,27 +151,35 @@ def _start_notes(system: System, start: Configuration) -> list[str]:
     return notes
 
 
-def acting_in(scene: MolecularScene, whole: SystemParts) -> Interactions:
-    """The interactions and fields of a resolved scene. Raises SceneError.
+def parts_as_they_act(parts: SystemParts) -> SystemParts:
+    """The parts of a system with the changes by features, such as scaled charges."""
+    for feature in acting_on(parts.scene):
+        parts = feature.acting(parts)
+    return parts
 
-    whole : its parts, with the whole charges of the species in [coupling]
-    """
-    parts = whole._replace(scene=scene, species=coupled(scene, whole.species))
-    acting = interactions(scene, parts)
-    acting.terms.update(field_terms(scene, parts))
+
+def acting_in(parts: SystemParts) -> Interactions:
+    """The interactions and fields of the parts of a system. Raises SceneError."""
+    acting = interactions(parts)
+    acting.terms.update(field_terms(parts.scene, parts))
     return acting
 
 
-def interactions(scene: MolecularScene, parts: SystemParts) -> Interactions:
-    """The interactions of a resolved scene. Raises SceneError."""
-    forces = scene.forces
-    names = [f"potentials.{key}" for key in POTENTIALS if getattr(forces, key) is not None]
+def interactions(parts: SystemParts) -> Interactions:
+    """The interactions of the parts of a system. Raises SceneError."""
+    scene, forces = parts.scene, parts.scene.forces
+    modules = {key: f"potentials.{key}" for key in POTENTIALS if getattr(forces, key) is not None}
     if any(m.charges.any() for m in parts.species):
-        names.append(ELECTROSTATICS[not_none(forces.electrostatics)].module)
+        modules["charges"] = ELECTROSTATICS[not_none(forces.electrostatics)].module
     if forces.dispersion != "cutoff":
-        names.append("ewald.dispersion")
+        modules["dispersion"] = "ewald.dispersion"
+    replaced = {
+        key: f for feature in acting_on(scene) for key, f in feature.potentials(scene).items()
+    }
     contributions = [
-        import_module(f"rigidmd.forces.{name}").interactions(parts) for name in names if name
+        (replaced.get(key) or import_module(f"rigidmd.forces.{module}").interactions)(parts)
+        for key, module in modules.items()
+        if module
     ]
     return Interactions(
         {name: term for part in contributions for name, term in part.terms.items()},

@@ -16,7 +16,7 @@ from rigidmd.assemble.time_step import with_time_steps
 from rigidmd.core.state import state_of
 from rigidmd.dynamics.model import Model
 from rigidmd.errors import SceneError
-from rigidmd.features.free_energy.coupling import with_coupling
+from rigidmd.features import acting_on
 from rigidmd.forces.neighbors.space import Orthorhombic, Space, cell_of, space_of
 from rigidmd.forces.parts import Composition, SystemParts
 from rigidmd.formats.cells import describe_basis, describe_cell
@@ -58,8 +58,11 @@ def resolve(scene: MolecularScene) -> ResolvedScene:
         cell = f"{describe_cell(cell_of(space))}, {describe_basis(start.basis)}"
     composition = Composition(species, counts, space, start.basis, cell, start.position)
     resolved = with_defaults(scene, composition)
-    complete, coupling_errors = with_coupling(resolved.scene, species)
-    if errors := [*errors, *resolved.errors, *coupling_errors]:
+    complete, errors = resolved.scene, [*errors, *resolved.errors]
+    for feature in acting_on(complete):
+        complete, more = feature.resolve(complete, species)
+        errors += more
+    if errors:
         raise SceneError(scene.source, errors)
     model = _model_of(species, index, frozen)
     state = state_of(

@@ -143,7 +143,7 @@ def observe(
         edges = [nan] * 6
     tensor_bar = pressure / BAR
     # not in pilot runs, whose samples are in no log
-    changes = [] if stage is None else _changes_with_lambda(system, state, potential)
+    extras = [] if stage is None else system.extras.values()
     energy = (potential + kinetic) / energy_unit
     ledger = state.energy_ledger / energy_unit
     conserved = energy - float(ledger.sum())
@@ -174,7 +174,7 @@ def observe(
         user_energies=(
             *(components[name] / energy_unit for name in system.user_terms),
             *(term.distance_in(state) for term in system.distances.values()),
-            *(change / energy_unit for change in changes),
+            *(x / energy_unit for extra in extras for x in extra.values(system, state, potential)),
             *trajectories,
         ),
     )
@@ -189,22 +189,6 @@ def observe(
         load,
         energy_unit,
     )
-
-
-def _changes_with_lambda(system: System, state: State, potential: float) -> list[float]:
-    """Energies at each of coupling.lambdas less the present one, u Å²/ps²."""
-    coupling = system.scene.coupling
-    changes = []
-    for value, engine in system.engines_at_lambda.items():
-        if coupling is not None and value == coupling.value:
-            changes.append(0.0)
-            continue
-        at = system.at_lambda[value]
-        engine.renew_lists()  # so that the bits do not depend on earlier states
-        energy = sum(tally.energy for tally in engine.evaluate(state)[1].values())
-        energy += 0.0 if at.tail is None else at.tail.energy(state.volume)
-        changes.append(energy + sum(at.constants.values()) - potential)
-    return changes
 
 
 def kinetic_energies(system: System, state: State) -> tuple[float, float]:

@@ -5,13 +5,13 @@ One table serves files, displays and documentation. For molecules it is the reco
 field has a `Column`.
 """
 
-import re
 from abc import ABC, abstractmethod
 from array import array
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from math import nan
 from operator import attrgetter
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, NamedTuple, get_args, get_type_hints
 
 import numpy as np
@@ -103,7 +103,7 @@ class Sample(NamedTuple):
     torque_squares: Annotated[
         float, Column("n^2/I (kJ/mole/ps^2)", "kJ/mol/ps²", "the same of torques n")
     ] = nan
-    # of user-defined forces, kJ/mol; then distances, Å, and OF_TRAJECTORIES
+    # in the columns that not all scenes have, see `System.more_columns`
     user_energies: tuple[float, ...] = ()
 
 
@@ -140,41 +140,15 @@ OF_TRAJECTORIES = {
 IN_LOGS = COLUMNS | OF_TRAJECTORIES
 
 
-DISTANCE = re.compile(r"distance_(\d+)")
-
-
 def distance_column(k: int) -> tuple[str, Column]:
     """Name and column of the distance that fields.restraints.k restrains."""
     about = f"distance of the groups of fields.restraints.{k}"
     return f"distance_{k}", Column(f"Distance {k} (A)", "Å", about)
 
 
-LAMBDA = re.compile(r"energy_to_lambda_(.+)")
-
-
-def lambda_column(value: float) -> tuple[str, Column]:
-    """Name and column of the energy at a lambda of coupling.lambdas."""
-    about = f"potential energy at lambda = {value:g} less the present one, of the same state"
-    return f"energy_to_lambda_{value:g}", Column(
-        f"Energy to lambda {value:g} (kJ/mole)", "kJ/mol", about
-    )
-
-
 def energy_column(name: str) -> Column:
     """The column of the energy of a user-defined force."""
     return Column(f"{name} (kJ/mole)", "kJ/mol", f"energy of the force {name}")
-
-
-def more_columns(names: Sequence[str]) -> dict[str, Column]:
-    """The columns of user-defined forces, of restrained distances, of other values of lambda and of
-    the trajectories of hybrid Monte Carlo."""
-    known = OF_TRAJECTORIES | dict(
-        distance_column(int(match[1])) for name in names if (match := DISTANCE.fullmatch(name))
-    )
-    known |= dict(
-        lambda_column(float(match[1])) for name in names if (match := LAMBDA.fullmatch(name))
-    )
-    return {name: known.get(name) or energy_column(name) for name in names}
 
 
 NUMBERS = [name for name in COLUMNS if name != "stage_name"]
@@ -286,19 +260,19 @@ class Samples(SampleTable):
     """The samples of a run in order: a table with one row of float64 per sample.
 
     stages : names of all stages
-    user_terms : names of user-defined forces, whose energies are columns, and of OF_TRAJECTORIES
+    more : further columns, in the order of `Sample.user_energies`
     table : the result of an earlier `table()`. Raises ValueError if it is invalid.
     """
 
     def __init__(
         self,
         stages: Sequence[str],
-        user_terms: tuple[str, ...] = (),
+        more: Mapping[str, Column] = MappingProxyType({}),
         table: np.ndarray | None = None,
     ):
-        self.stages, self.user_terms = tuple(stages), user_terms
-        self.described = COLUMNS | more_columns(user_terms)
-        self._numbers = [*NUMBERS, *user_terms]
+        self.stages, self.more = tuple(stages), more
+        self.described = COLUMNS | dict(more)
+        self._numbers = [*NUMBERS, *more]
         self._values = array("d")  # grows in place
         if table is not None:
             if table.ndim != 2 or table.shape[1] != len(self._numbers) or table.dtype != np.float64:
@@ -356,7 +330,7 @@ class Samples(SampleTable):
 
     def of_stage(self, k: int) -> "Samples":
         """The samples of stage k, which are contiguous."""
-        samples = Samples(self.stages, self.user_terms)
+        samples = Samples(self.stages, self.more)
         width = len(self._numbers)
         if len(rows := np.flatnonzero(self._column("stage") == k)):
             samples._values = self._values[rows[0] * width : (rows[-1] + 1) * width]
@@ -404,7 +378,7 @@ def _slow_series(
 def equilibrated(of_stage: Samples, stage: "Stage") -> Samples:
     """The samples of the equilibrated part of a stage."""
     return Samples(
-        of_stage.stages, of_stage.user_terms, of_stage.table()[equilibrated_from(of_stage, stage) :]
+        of_stage.stages, of_stage.more, of_stage.table()[equilibrated_from(of_stage, stage) :]
     )
 
 

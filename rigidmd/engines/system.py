@@ -1,10 +1,10 @@
 """The system of a scene of molecules: what an engine moves."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import inf
-from typing import NamedTuple, Protocol, cast, runtime_checkable
+from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 import numpy as np
 
@@ -12,13 +12,12 @@ from rigidmd.core.state import State
 from rigidmd.core.state_file import SavedState, array_errors
 from rigidmd.dynamics.model import DegreesOfFreedom, Model, mobile
 from rigidmd.engines.cpu.engine import CpuEngine, Precision
-from rigidmd.engines.samples import OF_TRAJECTORIES, lambda_column
+from rigidmd.engines.samples import OF_TRAJECTORIES, Column, distance_column, energy_column
 from rigidmd.engines.sites import Sites
-from rigidmd.features.potentials.poses.potential import BodyPairPotential
 from rigidmd.forces.fields.distances import DistanceRestraint
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.space import Space, space_of, wrap
-from rigidmd.forces.parts import Interactions, Tail, gather_per_molecule
+from rigidmd.forces.parts import Tail, gather_per_molecule
 from rigidmd.forces.terms import trait
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import Molecule
@@ -32,6 +31,24 @@ class ThermostatOfStages(Protocol):
     def for_stage(self, system: "System", k: int) -> NamedTuple:
         """The thermostat of stage k, of a class with `compiled_thermostat`."""
         ...
+
+
+@dataclass(frozen=True)
+class Extra:
+    """What a feature adds to a system, in addition to its terms."""
+
+    #: Name of a term that it adds, whose energy is a column -> description
+    user_terms: Mapping[str, str] = field(default_factory=dict)
+    #: Name of a term that Python computes -> function
+    python_forces: Mapping[str, Callable] = field(default_factory=dict)
+    #: In place of the thermostat of every stage
+    thermostat: "NamedTuple | ThermostatOfStages | None" = None
+    #: Columns of the log
+    columns: Mapping[str, Column] = field(default_factory=dict)
+
+    def values(self, system: "System", state: State, potential: float) -> list[float]:
+        """Values of `columns`, u Å²/ps², of a state with a potential energy."""
+        return []
 
 
 @dataclass(frozen=True)
@@ -61,21 +78,37 @@ class System:
     force_error: float | None = (
         None  # estimated rms error of the Coulomb force on a site, u Å/ps²; with Ewald sums
     )
-    #: lambda -> the interactions at it, see coupling.lambdas
-    at_lambda: dict[float, Interactions] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)  # of what is allowed and probably not meant
-    #: Name of a term that Python computes -> function
-    python_forces: dict[str, Callable] = field(default_factory=dict)
-    #: User-defined, in place of the thermostat of every stage
-    thermostat: "NamedTuple | ThermostatOfStages | None" = None
-    #: Name of a user-defined term -> description
-    user_terms: dict[str, str] = field(default_factory=dict)
-    #: Those that are potentials of pairs of bodies
-    body_pairs: dict[str, BodyPairPotential] = field(default_factory=dict)
+    extras: dict[str, Extra] = field(default_factory=dict)  # by the name of a feature
 
     def __repr__(self) -> str:
         return f"<System of {self.scene.in_short}>"
+
+    @property
+    def user_terms(self) -> dict[str, str]:
+        """Name of a term that a feature adds -> description."""
+        return {
+            name: text for extra in self.extras.values() for name, text in extra.user_terms.items()
+        }
+
+    @property
+    def python_forces(self) -> dict[str, Callable]:
+        """Name of a term that Python computes -> function."""
+        return {
+            name: f for extra in self.extras.values() for name, f in extra.python_forces.items()
+        }
+
+    @property
+    def thermostat(self) -> "NamedTuple | ThermostatOfStages | None":
+        """User-defined, in place of the thermostat of every stage."""
+        given = (extra.thermostat for extra in self.extras.values())
+        return next((thermostat for thermostat in given if thermostat is not None), None)
+
+    @cached_property
+    def cache(self) -> dict[str, Any]:
+        """What features compute once for this system."""
+        return {}
 
     @cached_property
     def sites(self) -> Sites:
@@ -139,15 +172,16 @@ class System:
         }
 
     @property
-    def more_columns(self) -> tuple[str, ...]:
-        """The columns of this scene that not all scenes have."""
-        distances = (name.replace("restraints", "distance") for name in self.distances)
-        return (
-            *self.user_terms,
-            *distances,
-            *(lambda_column(value)[0] for value in self.at_lambda),
-            *(OF_TRAJECTORIES if any(stage.is_hybrid for stage in self.scene.stages) else ()),
-        )
+    def more_columns(self) -> dict[str, Column]:
+        """The columns of this scene that not all scenes have, in the order of
+        `Sample.user_energies`."""
+        columns = {name: energy_column(name) for name in self.user_terms}
+        columns |= dict(distance_column(int(name.rpartition("_")[2])) for name in self.distances)
+        for extra in self.extras.values():
+            columns |= extra.columns
+        if any(stage.is_hybrid for stage in self.scene.stages):
+            columns |= OF_TRAJECTORIES
+        return columns
 
     @property
     def removes_momentum_every(self) -> float | None:
@@ -250,11 +284,6 @@ class System:
             scene.threads,
             virials,
         )
-
-    @cached_property
-    def engines_at_lambda(self) -> dict[float, CpuEngine]:
-        """An engine of the interactions at each of coupling.lambdas."""
-        return {x: self.engine_of(at.terms, self.precision) for x, at in self.at_lambda.items()}
 
     def of_sites(self, of: Callable[[Molecule], np.ndarray]) -> np.ndarray:
         """Values of all sites (s,). `of` returns the values of one molecule."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from rigidmd.feature import Row
+from rigidmd.feature import Feature, Row
 
 FEATURES = (
     Row(
@@ -17,7 +17,12 @@ FEATURES = (
         commands=("export", "verify"),
         programs=("gromacs", "lammps", "openmm"),
     ),
-    Row("potentials", "interactions of users: formula, table, Python function"),
+    Row(
+        "potentials",
+        "interactions of users: formula, table, Python function",
+        keys=("forces.custom", "forces.bodies", "from_python"),
+        acts=True,
+    ),
     Row(
         "analysis",
         "analyses of runs",
@@ -28,6 +33,8 @@ FEATURES = (
         "free_energy",
         "coupling, insertion, mean force, virial coefficients",
         needs=("analysis", "potentials", "studies"),
+        keys=("coupling",),
+        acts=True,
         commands=("virial",),
         analyses=("insertion",),
     ),
@@ -71,6 +78,12 @@ def used_by(scene: object) -> Iterator[Row]:
     for row in FEATURES:
         if any(_has(scene, *key.partition("=")[::2]) for key in row.keys):
             yield row
+
+
+def acting_on(scene: object) -> list[Feature]:
+    """The features that a scene uses and that change its system. Raises MissingFeatureError."""
+    rows = (row for row in used_by(scene) if row.acts)
+    return [row.load(f"the scene, which has {' or '.join(row.keys)},") for row in rows]
 
 
 def _has(value: object, path: str, wanted: str) -> bool:

@@ -9,7 +9,7 @@ OpenMM's StateDataReporter.
 import csv
 import io
 import time as clock
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from math import inf
 from operator import attrgetter
@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from rigidmd.core.files import AppendedFile, unreadable_reason, writing
 from rigidmd.core.toml import shorten_repr
 from rigidmd.engines import samples
-from rigidmd.engines.samples import Sample
+from rigidmd.engines.samples import Column, Sample
 from rigidmd.errors import OutputError
 from rigidmd.io.folder import check_inside
 from rigidmd.scene.validation import Flag, Number, validation_messages
@@ -197,10 +197,10 @@ TENSOR = tuple(
 )
 
 
-def columns(tensor: bool = True, user_terms: Sequence[str] = ()) -> dict[str, str]:
-    """Name of each column -> its header, with or without the pressure tensor. user_terms : see
+def columns(tensor: bool = True, more: Mapping[str, Column] | None = None) -> dict[str, str]:
+    """Name of each column -> its header, with or without the pressure tensor. more : see
     `Samples`"""
-    described = samples.COLUMNS | samples.more_columns(user_terms)
+    described = samples.COLUMNS | dict(more or {})
     written = {name: column.header for name, column in described.items() if column.header}
     if tensor:
         return written
@@ -213,7 +213,7 @@ class Log(AppendedFile):
 
     kept : earlier value of the property `kept`, from which the file is continued. None begins a new
         file
-    tensor, user_terms : see `columns`
+    tensor, more : see `columns`
     """
 
     def __init__(
@@ -222,10 +222,10 @@ class Log(AppendedFile):
         *,
         tensor: bool,
         kept: Sequence[int] | None = None,
-        user_terms: Sequence[str] = (),
+        more: Mapping[str, Column] | None = None,
     ):
-        self._columns = columns(tensor, user_terms)
-        shared = [name for name in self._columns if name not in user_terms]
+        self._columns = columns(tensor, more)
+        shared = [name for name in self._columns if name not in (more or {})]
         self._values = attrgetter(*shared)
         self._time = shared.index("time")
         self._rows: list[list] = []

@@ -6,7 +6,7 @@ search for its cause.
 
 from collections.abc import Iterable
 from math import inf, sqrt
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from rigidmd.engines.protocol import NotFiniteError
 from rigidmd.engines.samples import Sample
 from rigidmd.engines.system import System
 from rigidmd.errors import SimulationError
-from rigidmd.formats.cells import pairs_within
 from rigidmd.run.failed_check import MIN_INERTIA_FRACTION, ROUNDING, FailedCheck
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.molecules import Watch, name_of
@@ -202,34 +201,6 @@ def check_sample(system: System, limits: Watch, since: Sample, now: Sample) -> F
         f" {now.time - since.time:g} ps, {abs(drift) * fraction / scale if scale else inf:.3g}"
         f" kinetic energies (watch.energy = {limits.energy:g})"
     )
-
-
-def within_table(system: System, state: State) -> str:
-    """A warning of two bodies that are nearer than the first distance of a table of energies. Empty
-    without one."""
-    for name, potential in system.body_pairs.items():
-        first = getattr(potential.function, "first", 0.0)
-        if not first:
-            continue
-        from rigidmd.features.potentials.poses.pairs import (  # for such scenes only
-            BodyPairs,
-            reference_points,
-        )
-
-        term = cast(BodyPairs, system.terms[name])
-        bodies, point = reference_points(term, state)
-        i, j, step = pairs_within(point, state.cell if state.volume < inf else None, first)
-        distance = np.linalg.norm(step, axis=1)
-        distance[term.group[bodies[i]] == term.group[bodies[j]]] = inf
-        if distance.min(initial=inf) < first:
-            k = int(distance.argmin())
-            one, other = (molecule_label(system, int(bodies[side[k]])) for side in (i, j))
-            return (
-                f"{name}: {one} and {other} have a distance of {distance[k]:.3g} Å. The table"
-                f" begins at {first:g} Å, and nearer its energy is a guess: begin it at shorter"
-                " distances"
-            )
-    return ""
 
 
 def molecule_label(system: System, molecule: int) -> str:

@@ -1,6 +1,7 @@
 """Runs of molecules: removal of overlaps, stages of all ensembles, samples."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from math import isfinite, nan
@@ -24,9 +25,7 @@ from rigidmd.engines.protocol import Engine, NotFiniteError
 from rigidmd.engines.samples import OF_TRAJECTORIES, Samples
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, SimulationError, StructureError
-from rigidmd.features import used_by
-from rigidmd.features.potentials.user_code.binding import user_errors_explained
-from rigidmd.features.potentials.user_code.compiled import check_compiled_code
+from rigidmd.features import acting_on, used_by
 from rigidmd.formats import format_of
 from rigidmd.formats.through_ase import atoms_of_system
 from rigidmd.io.checkpoint import Checkpoint
@@ -172,7 +171,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
                 other.close()
         else:
             self._remove_overlaps()
-            with user_errors_explained(self.system):
+            with self._explained():
                 for k, stage in enumerate(self.scene.stages):
                     if stage.is_minimisation:
                         self._compile_stage(k)
@@ -184,14 +183,23 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         for sentence in sentences:
             self.simulation._note(sentence)
 
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        """Errors of features as errors of the scene."""
+        with ExitStack() as stack:
+            for feature in acting_on(self.scene):
+                stack.enter_context(feature.explained(self.system))
+            yield
+
     def _remove_overlaps(self) -> None:
         """Compile the forces, and remove overlaps of a lattice."""
         system = self.system
         scene = self.scene
         first = self.scene.stages[0]
-        for note in check_compiled_code(system, self.state):
-            self.simulation._note(note)
-        with user_errors_explained(system):
+        for feature in acting_on(scene):
+            for note in feature.check_start(system, self.state):
+                self.simulation._note(note)
+        with self._explained():
             _, tallies = self.engine.evaluate(self.state)
         if not all(np.isfinite(tally.energy) for tally in tallies.values()):
             raise SceneError(
@@ -470,7 +478,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         )
 
     def observe_now(self) -> Observation:
-        with interruptible(), user_errors_explained(self.system):
+        with interruptible(), self._explained():
             if not self._is_sampled:
                 return observe(self.system, self.engine, self.state)
             now = self.state

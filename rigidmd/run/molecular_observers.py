@@ -9,6 +9,7 @@ import numpy as np
 from rigidmd.core.state import NOW, Load, State
 from rigidmd.core.state_file import write_state
 from rigidmd.engines.samples import Samples
+from rigidmd.features import acting_on
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import FINAL, LAST_GOOD, LOG
 from rigidmd.io.run_files import TENSOR_FILE, Log, TensorFile, tensor_row
@@ -34,7 +35,7 @@ class LogFile(GrowingFile[Log]):
 
     def begin(self, run: "Simulation") -> None:
         self._file = Log(
-            run.path(LOG), tensor=self._tensor, kept=self.kept, user_terms=run.system.more_columns
+            run.path(LOG), tensor=self._tensor, kept=self.kept, more=run.system.more_columns
         )
 
     def see(self, moment: Moment) -> None:
@@ -95,7 +96,7 @@ class Sampler(Observer):
         self.samples = Samples([stage.label for stage in run.scene.stages], run.system.more_columns)
         self.last_good: State | None = None
         self._run, self._check = run, check
-        self._warns = True  # of bodies within the first distance of a table, once
+        self._warns = acting_on(run.scene)  # each once
         self.trajectories = np.zeros(5)  # see `Engine.trajectories`, at the last sample
         if any(stage.is_hybrid for stage in run.scene.stages):
             self.remembers = self.remembers | {"trajectories": np.ndarray}
@@ -124,9 +125,11 @@ class Sampler(Observer):
         _check_next_step(run, self._check, moment.observation.load, stage)
         if problem := checks.check_sample(run.system, run.scene.watch, samples.row(since), now):
             raise problem
-        if self._warns and (warning := checks.within_table(run.system, run._part.state)):
-            self._warns = False
-            run._note(warning)
+        for feature in self._warns:
+            if warning := feature.warning_at(run.system, run._part.state):
+                self._warns.remove(feature)
+                run._note(warning)
+                break
         self._check.rescale(kinetic)
         self.last_good = None  # its memory is free for the next
         self.last_good = run._part.state.copy()
@@ -137,7 +140,7 @@ class Sampler(Observer):
 
     @table.setter
     def table(self, table: np.ndarray) -> None:
-        self.samples = Samples(self.samples.stages, self.samples.user_terms, table)
+        self.samples = Samples(self.samples.stages, self.samples.more, table)
 
     def resume(self, run: "Simulation", kept: Checkpoint) -> None:
         """Restore the samples. The state of the checkpoint is the last good one."""

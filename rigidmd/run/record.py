@@ -63,13 +63,14 @@ class Record(Generic[SystemT]):
         more = self.system.more_columns
         # energies of user-defined forces, which the system is read without
         known = {*samples.IN_LOGS, *more}
-        names = (*(name for name in self.columns if name not in known), *more)
+        users = (name for name in self.columns if name not in known)
+        columns = {name: samples.energy_column(name) for name in users} | more
         unknown = np.full(len(self.time), np.nan)
         table = np.column_stack(
-            [self.columns.get(name, unknown) for name in (*samples.NUMBERS, *names)]
+            [self.columns.get(name, unknown) for name in (*samples.NUMBERS, *columns)]
         )
         return samples.Samples(
-            [stage.label for stage in self.system.scene.stages], names, table.astype(float)
+            [stage.label for stage in self.system.scene.stages], columns, table.astype(float)
         )
 
     @property
@@ -114,7 +115,7 @@ def read_record(folder: Path) -> Record:
         columns = _motion(folder, system, missing)
     else:
         system = build(scene, user_code=False)
-        columns = _log(folder, scene)
+        columns = _log(folder, system)
     if not columns or len(next(iter(columns.values()))) == 0:
         raise OutputError(f"{folder}: the run has not written samples yet. {resume}")
     return Record(
@@ -122,15 +123,12 @@ def read_record(folder: Path) -> Record:
     )
 
 
-def _log(folder: Path, scene: MolecularScene) -> dict[str, np.ndarray]:
+def _log(folder: Path, system: System) -> dict[str, np.ndarray]:
     """Columns of log.csv by their names in `results[...]`, with the index of the stage."""
     read = read_columns(folder / LOG)
     if read is None:
         raise OutputError(f"{folder / LOG} cannot be read: there is no such file")
-    distances = dict(samples.distance_column(k) for k in range(len(scene.fields.restraints)))
-    lambdas = () if scene.coupling is None else scene.coupling.lambdas
-    more = distances | dict(map(samples.lambda_column, lambdas))
-    known = HEADERS | {column.header: name for name, column in more.items()}
+    known = HEADERS | {column.header: name for name, column in system.more_columns.items()}
     unit = samples.energy_column("").header
     headers = {
         known.get(header) or header.removesuffix(unit): header
@@ -146,7 +144,9 @@ def _log(folder: Path, scene: MolecularScene) -> dict[str, np.ndarray]:
         else read.numbers(header, finite=name == "time")
         for name, header in headers.items()
     }
-    return columns | {"stage": _stage_of(columns["stage_name"], columns["time"], scene.stages)}
+    return columns | {
+        "stage": _stage_of(columns["stage_name"], columns["time"], system.scene.stages)
+    }
 
 
 def _stage_of(names: np.ndarray, time: np.ndarray, stages: Sequence[Stage]) -> np.ndarray:

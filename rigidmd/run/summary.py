@@ -469,7 +469,7 @@ def _minimised(
     """Values of a minimisation, at its end. None for those that only a stage of motion has."""
     stage = system.scene.stages[k]
     minimum_values = minimum_figures(minimum, len(system.model.species))
-    end = Samples(samples.stages, samples.user_terms, samples.of_stage(k).table()[-1:])
+    end = Samples(samples.stages, samples.more, samples.of_stage(k).table()[-1:])
     return dict.fromkeys(stage_summary(system, samples, k, computing, (0, 0))) | {
         "name": stage.label,
         "ensemble": stage.ensemble,

@@ -5,7 +5,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from rigidmd.engines.samples import COLUMNS, Sample, Samples
+from rigidmd.engines.samples import COLUMNS, Sample, Samples, energy_column
 
 
 def a_sample(k: int, own: tuple[float, ...] = ()) -> Sample:
@@ -17,12 +17,12 @@ def a_sample(k: int, own: tuple[float, ...] = ()) -> Sample:
 
 
 def test_samples_give_back_what_was_added():
-    samples = Samples(["a", "b"], ("spring", "field"))
+    samples = Samples(["a", "b"], {name: energy_column(name) for name in ("spring", "field")})
     assert len(samples["time"]) == 0
     added = [a_sample(k, (k / 3, -k)) for k in range(10)]
     for sample in added:
         samples.append(sample)
-    assert samples.rows == list(Samples(["a", "b"], samples.user_terms, samples.table())) == added
+    assert samples.rows == list(Samples(["a", "b"], samples.more, samples.table())) == added
     assert samples.row(-1) == added[-1]
     for name in COLUMNS:
         assert samples[name].tolist() == [getattr(sample, name) for sample in added]
@@ -58,11 +58,11 @@ def test_rows_that_are_not_samples_are_refused(change, expected):
     samples = Samples(["a", "b"])
     samples.append(a_sample(6))
     with pytest.raises(ValueError, match=expected):
-        Samples(["a", "b"], (), change(samples.table()))
+        Samples(["a", "b"], {}, change(samples.table()))
 
 
 def test_a_sample_takes_no_more_than_its_numbers():
-    samples = Samples(["a", "b"], ("spring",))
+    samples = Samples(["a", "b"], {"spring": energy_column("spring")})
     tracemalloc.start()
     for k in range(5000):
         samples.append(a_sample(k % 10, (0.0,)))

@@ -135,21 +135,15 @@ def upward(package, found):
 
 #: Files of the core that import a feature.
 REACHING_UP = (
-    "assemble/build.py",
     "assemble/describe.py",
-    "assemble/resolve.py",
     "assemble/scenes.py",
     "commands/arguments.py",
     "commands/check.py",
     "dynamics/step_loop.py",
     "engines/cpu/compiled.py",
     "engines/cpu/engine.py",
-    "engines/system.py",
-    "forces/potentials/lennard_jones.py",
     "io/trajectory.py",
     "io/trajectory_file.py",
-    "run/checks.py",
-    "run/molecular.py",
     "run/part.py",
     "run/pilot/sampling.py",
     "run/pilot/stages.py",

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeVar
 import numpy as np
 
 from rigidmd.engines.system import System
+from rigidmd.features.potentials.extra import body_pairs_of
 from rigidmd.features.potentials.sites.custom import CustomPotential
 from rigidmd.forces.ewald.corrections import Background, SurfaceDipole
 from rigidmd.forces.ewald.direct_sum import EwaldSum
@@ -167,7 +168,7 @@ def unknown_terms(
     body_pairs : see `external.Translations`
     """
     for name, term in system.terms.items():
-        if potential := system.body_pairs.get(name):
+        if potential := body_pairs_of(system).get(name):
             if limits := body_pairs.get(type(potential.function)):
                 yield from (f"{name}: {message}" for message in limits(potential, system))
             else:

@@ -1,11 +1,20 @@
-"""[coupling] of a scene: its defaults, the species with scaled charges."""
+"""[coupling] of a scene: its defaults, the species with scaled charges, and the energies at other
+values of lambda."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
+from rigidmd.assemble.build import acting_in
+from rigidmd.core.state import State
+from rigidmd.engines.cpu.engine import CpuEngine
+from rigidmd.engines.samples import Column
+from rigidmd.engines.system import Extra, System
+from rigidmd.forces.parts import Interactions, SystemParts
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import Molecule
+from rigidmd.scene.validation import not_none
 
+NAME = "free_energy"
 CHARGES_FROM = 0.5
 
 
@@ -36,17 +45,65 @@ def with_coupling(
     return scene.model_copy(update={"coupling": coupling}), faults
 
 
-def coupled(scene: MolecularScene, species: Sequence[Molecule]) -> list[Molecule]:
-    """The species, one of them with scaled charges."""
-    if (coupling := scene.coupling) is None:
-        return list(species)
-    return [
+def coupled(parts: SystemParts) -> SystemParts:
+    """The parts of a system in which one species has scaled charges."""
+    coupling = not_none(parts.scene.coupling)
+    species = [
         replace(m, charges=coupling.charges * m.charges) if m.name == coupling.species else m
-        for m in species
+        for m in parts.species
     ]
+    return parts._replace(species=species)
 
 
-def at_lambda(scene: MolecularScene, value: float) -> MolecularScene:
-    """A scene with another lambda."""
-    assert scene.coupling is not None
-    return scene.model_copy(update={"coupling": scene.coupling.at(value)})
+@dataclass(frozen=True)
+class OtherLambdas(Extra):
+    """The interactions at coupling.lambdas, whose energies are columns."""
+
+    at: Mapping[float, Interactions] = field(default_factory=dict)
+
+    def values(self, system: System, state: State, potential: float) -> list[float]:
+        """Energies at each of coupling.lambdas less the present one, u Å²/ps²."""
+        present = not_none(system.scene.coupling).value
+        changes = []
+        for value, engine in self._engines(system).items():
+            if value == present:
+                changes.append(0.0)
+                continue
+            at = self.at[value]
+            engine.renew_lists()  # so that the bits do not depend on earlier states
+            energy = sum(tally.energy for tally in engine.evaluate(state)[1].values())
+            energy += 0.0 if at.tail is None else at.tail.energy(state.volume)
+            changes.append(energy + sum(at.constants.values()) - potential)
+        return changes
+
+    def _engines(self, system: System) -> dict[float, CpuEngine]:
+        """An engine of the interactions at each value, made once for a system."""
+        if NAME not in system.cache:
+            precision = system.precision
+            system.cache[NAME] = {
+                x: system.engine_of(at.terms, precision) for x, at in self.at.items()
+            }
+        return system.cache[NAME]
+
+
+def with_other_lambdas(system: System, parts: SystemParts) -> System:
+    """The system with the energies at coupling.lambdas, and a note. Raises SceneError.
+
+    parts : with whole charges
+    """
+    coupling = not_none(parts.scene.coupling)
+    at = {}
+    for value in coupling.lambdas:
+        scene = parts.scene.model_copy(update={"coupling": coupling.at(value)})
+        at[value] = acting_in(coupled(parts._replace(scene=scene)))
+    columns = dict(map(lambda_column, at))
+    system.notes.append(coupling.in_short)
+    return replace(system, extras=system.extras | {NAME: OtherLambdas(columns=columns, at=at)})
+
+
+def lambda_column(value: float) -> tuple[str, Column]:
+    """Name and column of the energy at a lambda of coupling.lambdas."""
+    about = f"potential energy at lambda = {value:g} less the present one, of the same state"
+    return f"energy_to_lambda_{value:g}", Column(
+        f"Energy to lambda {value:g} (kJ/mole)", "kJ/mol", about
+    )

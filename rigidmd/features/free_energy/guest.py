@@ -20,6 +20,7 @@ from rigidmd.features.free_energy.guest_pairs import (
     add_guest_energies,
     pairs_of_kinds,
 )
+from rigidmd.features.potentials.extra import body_pairs_of
 from rigidmd.features.potentials.user_code.binding import with_user_code
 from rigidmd.forces.ewald.direct_sum import SAME_BASIS
 from rigidmd.forces.neighbors.pair_loop import PairForces
@@ -81,9 +82,10 @@ class Guest:
         self._pairs: list[tuple[PairForces, list[PairOfKinds]]] = []
         #: Terms that the engine evaluates
         self.engine_terms: list[str] = []
-        self._poses = [cast("BodyPairs", self._with.terms[name]) for name in self._with.body_pairs]
+        of_poses = body_pairs_of(self._with)
+        self._poses = [cast("BodyPairs", self._with.terms[name]) for name in of_poses]
         for name, term in self._with.terms.items():
-            if name in self._with.body_pairs:
+            if name in of_poses:
                 continue
             if isinstance(term, PairForces) and isinstance(term.potential, POTENTIALS):
                 is_guest = term.sites.molecule == len(self._host)
@@ -222,7 +224,7 @@ def _reassembled(system: System, host: np.ndarray, added: list[Molecule]) -> Sys
     parts = SystemParts(
         scene, species, model, system.space, state, number, SAME_BASIS, _grid_of(system)
     )
-    acting = interactions(scene, parts)
+    acting = interactions(parts)
     k_vectors = getattr(system.terms.get("coulomb_reciprocal"), "k_vectors", None)
     if k_vectors is not None and "coulomb_reciprocal" in acting.terms:
         term = acting.terms["coulomb_reciprocal"]._replace(k_vectors=k_vectors)  # type: ignore[attr-defined]
@@ -238,9 +240,7 @@ def _reassembled(system: System, host: np.ndarray, added: list[Molecule]) -> Sys
         constants=acting.constants,
         tail=acting.tail,
         residue_number=number,
-        python_forces={},
-        user_terms={},
-        body_pairs={},
+        extras={},
     )
     if scene.forces.added or scene.from_python:
         return with_user_code(made, is_start=False)

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.core.toml import Json
-from rigidmd.engines.samples import lambda_column
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError
 from rigidmd.features.analysis.files import write_results
 from rigidmd.features.analysis.result import AnalysisResult
+from rigidmd.features.free_energy.coupling import lambda_column
 from rigidmd.features.free_energy.estimate import NAME, OF_ALL, SampledLambda, free_energy_of
 from rigidmd.features.free_energy.keys import Coupling
 from rigidmd.features.free_energy.windows import (

@@ -16,9 +16,13 @@ from rigidmd.features.potentials.sites.custom import (
     energy_and_force_at,
     tail_of_pair,
 )
-from rigidmd.forces.parts import InnerPairs, Tail, sum_of_tails
+from rigidmd.forces.neighbors.pair_loop import PairForces
+from rigidmd.forces.neighbors.sites import exclusion_groups
+from rigidmd.forces.parts import InnerPairs, Interactions, SystemParts, Tail, sum_of_tails
+from rigidmd.forces.potentials import lennard_jones
 from rigidmd.forces.potentials.truncation import Truncation, truncation_terms
 from rigidmd.scene.forces import TruncationName
+from rigidmd.scene.validation import not_none
 
 SOFTNESS = 0.5  # at lambda = 0, the alpha of the paper
 
@@ -96,3 +100,43 @@ def tail_of_soft_core(potential: CustomPotential, inner: InnerPairs) -> Tail | N
         pairs = count[i] * count[j] * (1.0 if i == j else 2.0)
         tails.append(Tail(pairs * tail.energy_volume, pairs * tail.pressure_square, tail.constant))
     return sum_of_tails(tails)
+
+
+def interactions(parts: SystemParts) -> Interactions:
+    """Lennard-Jones forces between the sites without a soft core, and those of all others. Raises
+    SceneError."""
+    forces, coupling = parts.scene.forces, not_none(parts.scene.coupling)
+    soft = [m.name == coupling.species for m in parts.species]
+    found = lennard_jones.sites_of_scene(parts, soft)
+    if found is None or not found.is_separate.any():
+        return lennard_jones.interactions(parts)
+    potential, is_soft_kind, indices, inner, notes = found
+    plain_kinds = ~is_soft_kind
+    softened = soft_core(
+        potential.c12,
+        potential.c6,
+        potential.kind,
+        is_soft_kind,
+        coupling.lennard_jones,
+        potential.truncation,
+        forces.truncation,
+    )
+    sites = parts.sites(indices)
+    # one group of all molecules without a soft core, which have no pairs here
+    groups = exclusion_groups(sites, ~np.array(soft)[parts.model.species])
+    terms = {"soft_core": PairForces(softened, sites, groups)}
+    tails = [] if inner is None else [tail_of_soft_core(softened, inner)]
+    if count := int(plain_kinds.sum()):
+        plain = potential._replace(
+            kind=potential.kind[plain_kinds[potential.kind]],
+            c12=potential.c12[:count, :count],
+            c6=potential.c6[:count, :count],
+        )
+        no_sites = np.zeros(0, dtype=int)
+        plain_sites = [no_sites if s else i for i, s in zip(indices, soft, strict=True)]
+        terms["lennard_jones"] = parts.pair_forces(plain, parts.sites(plain_sites))
+        if inner is not None:
+            inside = InnerPairs(*(column[plain_kinds[inner.one]] for column in inner))
+            tails.append(lennard_jones.tail(plain, inside))
+    total = sum_of_tails([tail for tail in tails if tail is not None])
+    return Interactions(terms, {}, tail=total, notes=notes)

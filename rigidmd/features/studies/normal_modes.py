@@ -17,6 +17,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from rigidmd.core.state import NOW, State
 from rigidmd.engines.observables import observe
+from rigidmd.engines.samples import energy_column
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.features.studies.gamma_point import cells_of, periodic_basis
@@ -475,7 +476,8 @@ def write_animation(folder: Path, modes: NormalModes, number: int) -> None:
     q = AMPLITUDE / np.abs(c.scale * modes.vector[k]).max() * modes.vector[k]
     write_scene(folder, scene)
     write_topology(folder / output.topology, system, c.state, wrapped=False)
-    log = Log(folder / LOG, tensor=False, kept=None, user_terms=tuple(system.user_terms))
+    energies = {name: energy_column(name) for name in system.user_terms}
+    log = Log(folder / LOG, tensor=False, kept=None, more=energies)
     frames = open_trajectory(
         folder / str(output.trajectory), system, period / FRAMES, velocities=False, wrapped=False
     )

@@ -1,7 +1,7 @@
 """Lennard-Jones: 4 epsilon ((sigma/r)¹² - (sigma/r)⁶), with truncation, mixing rules and tail
 correction."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import inf, pi
 from typing import NamedTuple
 
@@ -11,12 +11,8 @@ from numba import types
 from rigidmd.compile import chosen_by_type, implements, is_a, kernel
 from rigidmd.compile.simd import inverse, inverse_square_root, load, polynomial, zeros
 from rigidmd.errors import SceneError
-from rigidmd.features.free_energy.keys import Coupling
-from rigidmd.features.free_energy.soft_core import soft_core, tail_of_soft_core
 from rigidmd.forces.ewald.smooth import InverseR6
 from rigidmd.forces.neighbors import pair_loop as pairs
-from rigidmd.forces.neighbors.pair_loop import PairForces
-from rigidmd.forces.neighbors.sites import exclusion_groups
 from rigidmd.forces.parts import (
     InnerPairs,
     Interactions,
@@ -25,7 +21,6 @@ from rigidmd.forces.parts import (
     gather_per_molecule,
     inner_pairs,
     sites_named,
-    sum_of_tails,
 )
 from rigidmd.forces.potentials.screened_coulomb import Screening, dispersion_screening
 from rigidmd.forces.potentials.truncation import (
@@ -49,7 +44,7 @@ from rigidmd.forces.potentials.truncation import (
     truncation_terms,
 )
 from rigidmd.scene.forces import TruncationName
-from rigidmd.scene.models import Mixing, Molecule
+from rigidmd.scene.models import Mixing
 from rigidmd.units import KJ_PER_MOL
 
 
@@ -166,8 +161,36 @@ def lennard_jones(
     )
 
 
+class LennardJonesSites(NamedTuple):
+    """The Lennard-Jones sites of a system."""
+
+    potential: LennardJones
+    is_separate: np.ndarray  # (kinds,) see `sites_of_scene`
+    indices: list[np.ndarray]  # of the sites of each species
+    inner: InnerPairs | None  # the pairs inside molecules, where the scene has a tail correction
+    notes: tuple[str, ...]
+
+
 def interactions(parts: SystemParts) -> Interactions:
     """The Lennard-Jones forces of a scene, with forces.lennard_jones. Raises SceneError."""
+    if (found := sites_of_scene(parts)) is None:
+        return Interactions({}, {})
+    return Interactions(
+        {"lennard_jones": parts.pair_forces(found.potential, parts.sites(found.indices))},
+        {},
+        tail=None if found.inner is None else tail(found.potential, found.inner),
+        notes=found.notes,
+    )
+
+
+def sites_of_scene(
+    parts: SystemParts, separate: Sequence[bool] | None = None
+) -> LennardJonesSites | None:
+    """The Lennard-Jones sites of a scene. None without them. Raises SceneError.
+
+    separate : whether the sites of each species are of kinds that no other species has, which
+        come last. Default: of no species
+    """
     forces = parts.scene.forces
     species = parts.species
     index = parts.model.species
@@ -176,10 +199,10 @@ def interactions(parts: SystemParts) -> Interactions:
         np.flatnonzero((m.epsilon > 0) | named[k].any(axis=(0, 1))) for k, m in enumerate(species)
     ]
     if not forces.lennard_jones or not any(len(c) for c in indices):
-        return Interactions({}, {})
-    soft = [_is_soft(parts.scene.coupling, m) for m in species]
+        return None
+    separate = separate or [False] * len(species)
     entries = [
-        [(soft[k], m.sigma[i], m.epsilon[i], tuple(named[k][:, :, i].ravel())) for i in c]
+        [(separate[k], m.sigma[i], m.epsilon[i], tuple(named[k][:, :, i].ravel())) for i in c]
         for k, (m, c) in enumerate(zip(species, indices, strict=True))
     ]
     kinds = sorted({entry for of_species in entries for entry in of_species})
@@ -223,75 +246,8 @@ def interactions(parts: SystemParts) -> Interactions:
     inner = None
     if forces.tail_correction:
         inner = inner_pairs(of_species, positions, parts.counts)
-    whole = np.array([not entry[0] for entry in kinds])
-    if not whole.all():
-        return _with_soft_core(parts, potential, indices, soft, whole, inner)._replace(notes=notes)
-    return Interactions(
-        {"lennard_jones": parts.pair_forces(potential, parts.sites(indices))},
-        {},
-        tail=None if inner is None else tail(potential, inner),
-        notes=notes,
-    )
-
-
-def _is_soft(coupling: Coupling | None, molecule: Molecule) -> bool:
-    """Whether [coupling] gives a molecule a soft core."""
-    if coupling is None or molecule.name != coupling.species:
-        return False
-    return coupling.lennard_jones < 1
-
-
-def _with_soft_core(
-    parts: SystemParts,
-    potential: LennardJones,
-    indices: list[np.ndarray],
-    soft: list[bool],
-    plain_kinds: np.ndarray,
-    intramolecular_pairs: InnerPairs | None,
-) -> Interactions:
-    """Lennard-Jones forces between the sites without a soft core, and those of all others.
-
-    potential, indices : of all sites, by species
-    soft : whether each species has a soft core
-    plain_kinds : whether each kind has none; these are first
-    intramolecular_pairs : the pairs inside molecules, None without tail corrections
-    """
-    forces = parts.scene.forces
-    sites = parts.sites(indices)
-    is_plain_molecule = ~np.array(soft)[parts.model.species]
-    plain_count = int(plain_kinds.sum())
-    softened = soft_core(
-        potential.c12,
-        potential.c6,
-        potential.kind,
-        ~plain_kinds,
-        parts.scene.coupling.lennard_jones,
-        potential.truncation,
-        forces.truncation,
-    )
-    # one group of all molecules without a soft core, which have no pairs here
-    terms = {"soft_core": PairForces(softened, sites, exclusion_groups(sites, is_plain_molecule))}
-    tails = (
-        [] if intramolecular_pairs is None else [tail_of_soft_core(softened, intramolecular_pairs)]
-    )
-    if plain_count:
-        plain_potential = potential._replace(
-            kind=potential.kind[plain_kinds[potential.kind]],
-            c12=potential.c12[:plain_count, :plain_count],
-            c6=potential.c6[:plain_count, :plain_count],
-        )
-        no_sites = np.zeros(0, dtype=int)
-        plain_sites = [
-            no_sites if is_soft else of_species
-            for of_species, is_soft in zip(indices, soft, strict=True)
-        ]
-        terms["lennard_jones"] = parts.pair_forces(plain_potential, parts.sites(plain_sites))
-        if intramolecular_pairs is not None:
-            inside = InnerPairs(
-                *(column[plain_kinds[intramolecular_pairs.one]] for column in intramolecular_pairs)
-            )
-            tails.append(tail(plain_potential, inside))
-    return Interactions(terms, {}, tail=sum_of_tails([one for one in tails if one is not None]))
+    is_separate = np.array([entry[0] for entry in kinds])
+    return LennardJonesSites(potential, is_separate, indices, inner, notes)
 
 
 def _sites_of_pairs(parts: SystemParts) -> list[np.ndarray]:

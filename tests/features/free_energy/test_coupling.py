@@ -14,8 +14,8 @@ import rigidmd
 from rigidmd.assemble.build import build, integrator_of_stage
 from rigidmd.commands.cli import main
 from rigidmd.core.state import state_of
-from rigidmd.engines.samples import lambda_column
 from rigidmd.errors import OutputError, SceneError
+from rigidmd.features.free_energy.coupling import lambda_column
 from rigidmd.features.free_energy.estimate import SampledLambda, free_energy_of
 from rigidmd.features.free_energy.soft_core import SOFTNESS, SoftCore
 from rigidmd.scene.models import load_model

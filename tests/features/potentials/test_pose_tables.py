@@ -12,7 +12,7 @@ from rigidmd.errors import SceneError
 from rigidmd.features.potentials.poses.formulas import formula_of_poses
 from rigidmd.features.potentials.poses.pairs import pair_slopes
 from rigidmd.features.potentials.poses.table import read_body_table
-from rigidmd.run.checks import within_table
+from rigidmd.features.potentials.user_code.pose_checks import within_table
 from rigidmd.units import KJ_PER_MOL
 
 #: An energy that rises inwards, of the points of `written_table`; cosine of the angle of two axes.

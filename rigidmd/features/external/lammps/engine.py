@@ -31,6 +31,7 @@ from rigidmd.features.external.lammps import files
 from rigidmd.features.external.lammps.ellipsoids import atoms, ellipsoids
 from rigidmd.features.external.lammps.program import PROGRAM
 from rigidmd.features.external.rigid_bodies import RigidBodies
+from rigidmd.features.potentials.extra import body_pairs_of
 from rigidmd.forces.ewald.corrections import background, self_energy
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
 from rigidmd.mechanics.free_rotor import NO_SYMMETRY, SplitRotor
@@ -209,7 +210,7 @@ class LammpsEngine(ExternalEngine):
         """Energies by the names of rigidmd's terms, without the constants of single charges."""
         view = self._view
         charge = view.charge * np.sqrt(files.COULOMB_REAL * files.KCAL)  # with LAMMPS' constant
-        names = [*view.system.body_pairs]
+        names = [*body_pairs_of(view.system)]
         others = len(self._styles) - len(names) - (view.coulomb is not None)
         names += ["lennard_jones"] * others
         potential = view.coulomb

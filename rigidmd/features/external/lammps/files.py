@@ -22,6 +22,7 @@ from rigidmd.features.external.force_field import (
 )
 from rigidmd.features.external.lammps.ellipsoids import atoms, ellipsoids, limits, orientations
 from rigidmd.features.external.rigid_bodies import RigidBodies
+from rigidmd.features.potentials.extra import body_pairs_of
 from rigidmd.features.potentials.poses.gay_berne import GayBerne
 from rigidmd.features.potentials.poses.pairs import BodyPairs
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
@@ -289,7 +290,7 @@ def _cutoff(cutoff: float) -> float:
 
 def pair_styles(view: ForceFieldView) -> list[PairStyle]:
     styles = [style for style in (_lennard_jones(view), _coulomb(view)) if style is not None]
-    return [_gay_berne(view, name) for name in view.system.body_pairs] + styles
+    return [_gay_berne(view, name) for name in body_pairs_of(view.system)] + styles
 
 
 def _lennard_jones(view: ForceFieldView) -> PairStyle | None:
@@ -345,7 +346,7 @@ def _coulomb(view: ForceFieldView) -> PairStyle | None:
 
 
 def _gay_berne(view: ForceFieldView, name: str) -> PairStyle:
-    potential = view.system.body_pairs[name]
+    potential = body_pairs_of(view.system)[name]
     coefficients = {}
     kinds = enumerate(ellipsoids(view), len(view.kinds))
     members = [(k, kind) for k, kind in kinds if kind.potential == name]

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.engines.system import System
+from rigidmd.features.potentials.extra import body_pairs_of
 from rigidmd.features.potentials.poses.potential import BodyPairPotential
 from rigidmd.scene.models import Molecule
 
@@ -38,7 +39,7 @@ def bodies_of_potentials(system: System) -> list[BodiesOfPotential]:
     """All bodies with potentials of two bodies, by potential and species."""
     names = np.array([molecule.name for molecule in system.species])
     bodies = []
-    for name, potential in system.body_pairs.items():
+    for name, potential in body_pairs_of(system).items():
         for molecule in {molecule.name: molecule for molecule in system.species}.values():
             members = np.flatnonzero((names == molecule.name)[system.model.species])
             if potential.acts_on(molecule.name) and len(members):

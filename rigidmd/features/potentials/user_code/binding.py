@@ -14,8 +14,9 @@ from rigidmd.dynamics.model import count_degrees_of_freedom
 from rigidmd.engines.cpu.compiled import LOAD
 from rigidmd.engines.cpu.engine import BOX, TRAJECTORY, CompileError
 from rigidmd.engines.samples import IN_LOGS
-from rigidmd.engines.system import System
+from rigidmd.engines.system import System, ThermostatOfStages
 from rigidmd.errors import SceneError, describe_error
+from rigidmd.features.potentials.extra import UserExtra, with_extra
 from rigidmd.features.potentials.user_code.body_pairs import (
     BodyPairPotential,
     bind_body_pairs,
@@ -128,18 +129,19 @@ def with_user_code(system: System, *, is_start: bool = True) -> System:
     is_start : whether it starts in its state, in which energies must be finite
     """
     scene, (added, thermostat) = system.scene, system.scene.user_code
+    in_stages = cast("ThermostatOfStages | None", thermostat)  # checked below
     forces = [*custom_forces(scene), *added]
     force_names = [*(entry.label for entry in scene.forces.added.values()), *map(name_of, added)]
     names = distinct(force_names, [*system.terms, *system.constants])
+    reserved = RESERVED | dict.fromkeys(system.more_columns, "a column of the log")
     errors = [
-        f"{name} is {RESERVED[name]}. Name the force otherwise"
+        f"{name} is {reserved[name]}. Name the force otherwise"
         for name in names
-        if name in RESERVED
+        if name in reserved
     ]
     # a force may add notes in `begin`
-    target = replace(
-        system, thermostat=thermostat, notes=[*system.notes], warnings=[*system.warnings]
-    )
+    target = replace(system, notes=[*system.notes], warnings=[*system.warnings])
+    target = with_extra(target, UserExtra(thermostat=in_stages))
     bound: dict[str, BoundTerm] = {}
     changed = np.zeros(3, bool)  # whether they may change components of the total momentum
     for name, force in zip(names, forces, strict=True):
@@ -171,7 +173,13 @@ def with_user_code(system: System, *, is_start: bool = True) -> System:
     functions = {name: one.function for name, one in bound.items() if one.function is not None}
     terms = {name: one.term for name, one in bound.items()}
     tails = [tail for tail in (system.tail, *(one.tail for one in bound.values())) if tail]
-    return replace(
+    extra = UserExtra(
+        user_terms={name: one.description for name, one in bound.items()},
+        python_forces=functions,
+        thermostat=in_stages,
+        body_pairs={name: one.body_pairs for name, one in bound.items() if one.body_pairs},
+    )
+    made = replace(
         target,
         scene=with_momentum_removal(scene, model.keeps_momentum),
         # Forces computed by Python come first: as long as they are missing, no other need be
@@ -180,10 +188,8 @@ def with_user_code(system: System, *, is_start: bool = True) -> System:
         model=model,
         freedom=count_degrees_of_freedom(model),
         tail=sum_of_tails(tails),
-        python_forces=functions,
-        user_terms={name: one.description for name, one in bound.items()},
-        body_pairs={name: one.body_pairs for name, one in bound.items() if one.body_pairs},
     )
+    return with_extra(made, extra)
 
 
 def is_thermostat(thermostat: object) -> bool:

@@ -1,17 +1,23 @@
 """Checks of potentials of two bodies at random poses: torques that nothing resists, and the
-distance at which bodies touch."""
+distance at which bodies touch. Bodies in a run within the first distance of a table."""
 
 from collections.abc import Callable, Iterator, Sequence
 from math import inf
+from typing import cast
 
 import numpy as np
 
+from rigidmd.core.state import State
 from rigidmd.dynamics.model import mobile
 from rigidmd.engines.system import System
+from rigidmd.features.potentials.extra import body_pairs_of
 from rigidmd.features.potentials.poses.bodies import reference_of
 from rigidmd.features.potentials.poses.formulas import PairValues, PoseFormula
+from rigidmd.features.potentials.poses.pairs import BodyPairs, reference_points
 from rigidmd.features.potentials.poses.potential import BodyPairPotential
+from rigidmd.formats.cells import pairs_within
 from rigidmd.mechanics.rotation import from_quaternion
+from rigidmd.run.checks import molecule_label
 from rigidmd.scene.models import OFF_AXIS, Molecule
 
 POSES, ORIENTATIONS = 4096, 64
@@ -127,3 +133,26 @@ def _message(potential: BodyPairPotential, m: Molecule, arm: np.ndarray) -> str:
     if abs(line[nearest]) > 1 - OFF_AXIS:
         return f"{what}. Use axis = '{'xyz'[nearest]}', the line of its masses"
     return f"{what}. Its masses must lie along {potential.axis}, the axis of the potential"
+
+
+def within_table(system: System, state: State) -> str:
+    """A warning of two bodies that are nearer than the first distance of a table of energies. Empty
+    without one."""
+    for name, potential in body_pairs_of(system).items():
+        first = getattr(potential.function, "first", 0.0)
+        if not first:
+            continue
+        term = cast(BodyPairs, system.terms[name])
+        bodies, point = reference_points(term, state)
+        i, j, step = pairs_within(point, state.cell if state.volume < inf else None, first)
+        distance = np.linalg.norm(step, axis=1)
+        distance[term.group[bodies[i]] == term.group[bodies[j]]] = inf
+        if distance.min(initial=inf) < first:
+            k = int(distance.argmin())
+            one, other = (molecule_label(system, int(bodies[side[k]])) for side in (i, j))
+            return (
+                f"{name}: {one} and {other} have a distance of {distance[k]:.3g} Å. The table"
+                f" begins at {first:g} Å, and nearer its energy is a guess: begin it at shorter"
+                " distances"
+            )
+    return ""

@@ -1,0 +1,47 @@
+"""What [[forces.custom]], [[forces.bodies]] and code of users add to a system. Their modules are
+loaded where they are needed: a stored run needs few of them."""
+
+from contextlib import AbstractContextManager
+
+from rigidmd.core.state import State
+from rigidmd.engines.system import System
+from rigidmd.errors import SceneError
+from rigidmd.feature import Feature
+from rigidmd.features.potentials.extra import UserExtra, body_pairs_of, with_extra
+from rigidmd.forces.parts import SystemParts
+from rigidmd.scene.molecules import missing_user_code
+
+
+class Potentials(Feature):
+    def extend(self, system: System, parts: SystemParts, *, user_code: bool) -> System:
+        scene = system.scene
+        if not user_code:
+            from rigidmd.features.potentials.user_code.body_pairs import potentials_of_stored_run
+
+            return with_extra(system, UserExtra(body_pairs=potentials_of_stored_run(scene)))
+        if scene.from_python != scene.user_code.names:
+            missing = missing_user_code(scene.from_python, scene.user_code.names)
+            raise SceneError(scene.source, [missing])
+        from rigidmd.features.potentials.user_code.binding import with_user_code
+
+        return with_user_code(system)
+
+    def explained(self, system: System) -> AbstractContextManager[None]:
+        from rigidmd.features.potentials.user_code.binding import user_errors_explained
+
+        return user_errors_explained(system)
+
+    def check_start(self, system: System, state: State) -> list[str]:
+        from rigidmd.features.potentials.user_code.compiled import check_compiled_code
+
+        return check_compiled_code(system, state)
+
+    def warning_at(self, system: System, state: State) -> str:
+        if not body_pairs_of(system):
+            return ""
+        from rigidmd.features.potentials.user_code.pose_checks import within_table
+
+        return within_table(system, state)
+
+
+FEATURE = Potentials()
