@@ -49,7 +49,7 @@ TESTED_BY = {
     "features/external/test_lammps.py": "features/external/commands/export features/external/commands/verify features/external/engines"
     " features/external/rigid_bodies features/external/verify",
     "features/external/test_settings.py": "core/programs features/external/feature features/external/force_field",
-    "features/free_energy/test_coupling.py": "features/free_energy/keys features/free_energy/estimate features/free_energy/soft_core"
+    "features/free_energy/test_coupling.py": "features/free_energy/keys features/free_energy/estimate features/free_energy/feature features/free_energy/soft_core"
     " features/free_energy/lambda_sweep",
     "features/free_energy/test_insertion.py": "features/free_energy/guest features/free_energy/guest_pairs"
     " features/free_energy/pose_trials",
@@ -66,7 +66,7 @@ TESTED_BY = {
     "features/potentials/test_torques.py": "features/potentials/user_code/pose_checks",
     "features/potentials/test_user_code.py": "features/potentials/user_code/binding"
     " features/potentials/user_code/compiled features/potentials/user_code/trust core/user_modules"
-    " features/potentials/user_code/kernels",
+    " features/potentials/user_code/kernels features/potentials/extra features/potentials/feature",
     "features/studies/accuracy/test_averages.py": "features/studies/accuracy/averages_report",
     "features/studies/sweep/test_sweeping.py": "features/studies/commands/compare features/studies/commands/sweep features/studies/compare"
     " features/studies/sweep/folder"
