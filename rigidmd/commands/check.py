@@ -64,7 +64,11 @@ def _check(options: Options) -> int:
 def _print_programs(system: "System") -> None:
     """Print the program of each stage that is not a minimisation."""
     from rigidmd.assemble.build import integrator_of_stage
-    from rigidmd.engines.cpu.program import describe_program, program_of
+    from rigidmd.engines.cpu.program import (
+        describe_program,
+        program_of_forces,
+        program_of_step,
+    )
 
     engine = system.engine()
     for k, stage in enumerate(system.scene.stages):
@@ -72,7 +76,9 @@ def _print_programs(system: "System") -> None:
             continue
         scheme = integrator_of_stage(system, k)
         print(f"\nprogram of a step of stages.{k} ({stage.label}, {scheme.name}):")
-        print(describe_program(program_of(engine, system.state, scheme)))
+        print(describe_program(program_of_step(engine, system.state, scheme)))
+    print("\nprogram of the forces:")
+    print(describe_program(program_of_forces(engine, system.state)))
 
 
 def _print_profile(scene: "MolecularScene") -> None:

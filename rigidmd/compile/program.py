@@ -85,12 +85,29 @@ class Program:
 def run_row(rows, k):
     """Call pass k; returns its status."""
     rows.status[0] = 0
-    _call_row(rows, rows.arguments, k)
+    call_row(rows, rows.arguments, k)
     return rows.status[0]
 
 
+@kernel
+def run_from(rows, when, row):
+    """Call the passes from number row[0] on that act at `when`, bits. Returns the first status that
+    is not 0, and the next call begins with its pass; or 0 after the last pass, and the next call
+    begins with the first one."""
+    rows.status[0] = 0
+    while row[0] < len(rows.address):
+        if rows.when[row[0]] & when != 0:
+            call_row(rows, rows.arguments, row[0])
+            if rows.status[0] != 0:
+                return rows.status[0]
+        row[0] += 1
+    row[0] = 0
+    return 0
+
+
 @kernel(inline=True)
-def _call_row(rows, arguments, k):
+def call_row(rows, arguments, k):
+    """Call pass k; its status is in `rows`."""
     if rows.blocks[k] == 1:
         call_address(rows.address[k], arguments[k], 0)
     else:
@@ -105,7 +122,7 @@ def run_passes(rows, arguments, when):
     for k in range(len(rows.address)):
         if rows.when[k] & when == 0:
             continue
-        _call_row(rows, arguments, k)
+        call_row(rows, arguments, k)
         if rows.status[0] != 0:
             break
     return rows.status[0]

@@ -7,11 +7,9 @@ from math import inf, log2
 from typing import Literal, NamedTuple
 
 #: Kinds of flows: forces; free flight and rotation; thermostat; removal of the total momentum;
-#: barostat; change of the volume by the inertia of a piston; start and test of a trajectory of
-#: hybrid Monte Carlo.
-KICK, DRIFT, THERMOSTAT, REMOVE_MOMENTUM, BAROSTAT, SCALE_BOX, BEGIN_TRAJECTORY, END_TRAJECTORY = (
-    range(8)
-)
+#: barostat; change of the volume by the inertia of a piston; what the extension of a thermostat
+#: does before and after some steps.
+KICK, DRIFT, THERMOSTAT, REMOVE_MOMENTUM, BAROSTAT, SCALE_BOX, BEGIN, END = range(8)
 #: Error of sums and mirrored fractions of a row, from printed coefficients.
 ROUNDING = 1e-10
 
@@ -98,14 +96,14 @@ class Scheme(_SchemeFields):
             return self._replace(flows=flows, thermostat=thermostat)
         return self._replace(flows=(*self.flows, Flow(THERMOSTAT, 1.0)), thermostat=thermostat)
 
-    def with_trajectories(self, thermostat: tuple, steps: int) -> "Scheme":
-        """This scheme in trajectories of `steps` steps that are accepted or rejected; new momenta
-        before each."""
+    def with_groups(self, thermostat: tuple, steps: int) -> "Scheme":
+        """This scheme with a thermostat that acts before every `steps` steps, and with what its
+        extension does before and after them."""
         begins = (
             Flow(THERMOSTAT, 1.0, every=steps, phase=0),
-            Flow(BEGIN_TRAJECTORY, 0.0, every=steps, phase=0),
+            Flow(BEGIN, 0.0, every=steps, phase=0),
         )
-        flows = (*begins, *self.flows, Flow(END_TRAJECTORY, 0.0, every=steps))
+        flows = (*begins, *self.flows, Flow(END, 0.0, every=steps))
         return self._replace(flows=flows, thermostat=thermostat)
 
     def with_barostat(self, barostat: tuple, every: int) -> "Scheme":
@@ -135,14 +133,14 @@ class Scheme(_SchemeFields):
         return self._replace(flows=(*self.flows, Flow(REMOVE_MOMENTUM, 0.0, every=every)))
 
     @property
+    def has_groups(self) -> bool:
+        """Whether its thermostat has an extension (dynamics.step_parts.StepExtension)."""
+        return any(flow.kind == BEGIN for flow in self.flows)
+
+    @property
     def variables(self) -> int:
         """How many numbers its thermostat and its barostat have in `state.extra_variables`."""
         return sum(getattr(flow, "variables", 0) for flow in (self.thermostat, self.barostat))
-
-    @property
-    def trajectory_steps(self) -> int:
-        """Steps that are accepted or rejected together; 0 without hybrid Monte Carlo."""
-        return max(flow.every if flow.kind == END_TRAJECTORY else 0 for flow in self.flows)
 
     @property
     def kicks(self) -> tuple[float, ...]:
@@ -161,8 +159,8 @@ class Scheme(_SchemeFields):
         without an error of order dt². See "Temperatures" in the theory chapter `errors`.
         """
         kinds = [flow.kind for flow in self.flows]
-        if END_TRAJECTORY in kinds:
-            return 0.0  # trajectories that are accepted or rejected have no time-step error
+        if END in kinds:
+            return 0.0  # steps that are accepted or rejected together have no time-step error
         if THERMOSTAT not in kinds:
             return self.shadow_correction
         last = len(kinds) - kinds[::-1].index(THERMOSTAT)

@@ -9,7 +9,6 @@ import numpy as np
 
 from rigidmd.compile import kernel
 from rigidmd.core.state import NEEDS_PYTHON_FORCES, OK, Load, State, no_load
-from rigidmd.dynamics.registers import LOADED
 from rigidmd.forces.terms import FORCES_ONLY, INTO_OTHER_LOAD, compute_load, copy
 
 #: The difference is taken over this fraction of tau a. Over the whole of tau a (Wisdom, Holman &
@@ -37,28 +36,6 @@ def gradient_workspace(state: State) -> GradientWorkspace:
         np.zeros(1),
         np.zeros(1, np.int64),
     )
-
-
-@kernel
-def needs_forces(progress, gradient, tau):
-    """Whether a kick has to wait for an evaluation of forces.
-
-    progress : see `registers`; gradient : the `GradientWorkspace`, or None; tau : of the kick, 0
-    without gradient
-    """
-    if gradient is None:
-        return progress[LOADED] == 0
-    if tau == 0.0 or progress[LOADED] == 0:
-        return progress[LOADED] == 0
-    return progress[LOADED] == 1 or gradient.tau[0] != tau
-
-
-@kernel
-def load_of_kick(load, gradient, tau):
-    """The forces and torques of a kick. For the arguments see `needs_forces`."""
-    if gradient is None:
-        return load
-    return load if tau == 0.0 else gradient.load
 
 
 def displace(model, state, load, tau):

@@ -13,7 +13,7 @@ from rigidmd.assemble.build import integrator_of_stage as row
 from rigidmd.compile import BoundTask
 from rigidmd.core.integrators import REMOVE_MOMENTUM, THERMOSTAT
 from rigidmd.core.state import NOW, ORIGIN, REMOVED
-from rigidmd.dynamics import barostats, step_loop, thermostats
+from rigidmd.dynamics import barostats, step_rows, thermostats
 from rigidmd.dynamics.barostats.cell_rescaling import strain_force
 from rigidmd.dynamics.model import draw_momenta, remove_momentum
 from rigidmd.dynamics.noise import BAROSTAT
@@ -316,7 +316,7 @@ def test_a_mixture_is_brought_to_rest_by_one_velocity_for_all(counts):
     before = state.velocity.copy()
     momentum = mass @ before
     kept = np.array([not field, True, True])
-    BoundTask(step_loop._remove_momentum, (system.model, state))()
+    BoundTask(step_rows._remove_momentum, (system.model, state))()
     assert (mass @ state.velocity)[kept] == pytest.approx(np.zeros(kept.sum()), abs=1e-12)
     assert before - state.velocity == pytest.approx(
         np.tile(kept * momentum / mass.sum(), (len(mass), 1))

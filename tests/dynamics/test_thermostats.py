@@ -270,7 +270,7 @@ def test_kinetic_energies_at_the_ends_are_those_of_a_thermostat_there(halved):
     assert scheme.kinetic_correction == 0
     assert BAOAB.with_thermostat(()).kinetic_correction == 1 / 8
     assert scheme.shadow_correction == pytest.approx(1 / 12)
-    assert VERLET.with_trajectories((), 5).kinetic_correction == 0
+    assert VERLET.with_groups((), 5).kinetic_correction == 0
 
 
 def test_degrees_of_freedom_follow_the_thermostat():

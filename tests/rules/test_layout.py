@@ -11,7 +11,7 @@ TESTS, PACKAGE = ROOT / "tests", ROOT / "rigidmd"
 
 #: Test file -> further modules that it tests.
 TESTED_BY = {
-    "assemble/test_build.py": "assemble/resolve dynamics/flows dynamics/model",
+    "assemble/test_build.py": "assemble/resolve dynamics/model",
     "assemble/test_defaults.py": "assemble/describe scene/forces",
     "assemble/test_matching.py": "assemble/assignment assemble/atom_kinds assemble/bonded_atoms",
     "commands/test_cli.py": "commands/arguments commands/check commands/compile commands/help"
@@ -22,6 +22,7 @@ TESTED_BY = {
     "core/test_state.py": "core/state_file",
     "dynamics/test_registers.py": "dynamics/observables",
     "dynamics/test_step_loop.py": "mechanics/batches",
+    "dynamics/test_step_table.py": "dynamics/step_parts dynamics/step_rows",
     "dynamics/test_thermostats.py": "assemble/stage_description",
     "end_to_end/test_faults.py": "core/files core/signals",
     "end_to_end/test_hostile_input.py": "core/process core/toml",

@@ -14,7 +14,7 @@ from rigidmd.assemble.stage_description import describe_stage
 from rigidmd.compile import implements
 from rigidmd.dynamics import barostats
 from rigidmd.errors import SceneError
-from rigidmd.forces.terms import WITH_ENERGIES
+from rigidmd.forces.terms import FORCES_ONLY
 from rigidmd.run import Simulation
 from rigidmd.scene import ensembles, schema
 from rigidmd.scene.ensemble_methods import Barostat, Thermostat
@@ -111,13 +111,10 @@ class Swelling(NamedTuple):
     tail: tuple
     key: tuple
 
-    tallies = WITH_ENERGIES
+    forces = FORCES_ONLY
 
-    def passes(self, state, registers):
-        return {}
-
-
-implements(barostats.apply_barostat, Swelling)(barostats.try_move)
+    def rows(self, parts, timing, when):
+        return barostats.rows_of_moves(self, parts, timing, when)
 
 
 @implements(barostats.propose_strain, Swelling)

@@ -1,10 +1,10 @@
-"""Barostats: flows that change the cell at a pressure, each a pass of the step. A constant volume
+"""Barostats: flows that change the cell at a pressure, as rows of the step. A constant volume
 has none.
 
 See the theory chapter `sampling`. A lower triangular matrix T multiplies the cell (rows a, b, c)
 and the centres of mass from the right. The virial is W_ij = sum F_i R_j in `tally[1:]`.
-`apply_barostat` acts where a scheme has the flow BAROSTAT; `try_move` is the one by trial moves.
-The energy added to the molecules is in `state.energy_ledger[WORK]`.
+Its rows act where a scheme has the flow BAROSTAT; `rows_of_moves` are those of trial moves. The
+energy added to the molecules is in `state.energy_ledger[WORK]`.
 """
 
 from math import exp, log
@@ -12,14 +12,15 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from rigidmd.compile import Pass, chosen_by_type, kernel, load_arguments, task
-from rigidmd.core.integrators import BAROSTAT
-from rigidmd.core.state import NOW, OK, ORIGIN, TALLY_SIZE, WORK, Load, State, no_load
+from rigidmd.compile import Pass, kernel, load_arguments, task
+from rigidmd.core.state import NOW, ORIGIN, TALLY_SIZE, WORK, Load, State, no_load
 from rigidmd.dynamics.noise import Key, uniforms
-from rigidmd.dynamics.registers import LOADED, TRIAL, Registers
+from rigidmd.dynamics.registers import KEPT_BY_BAROSTAT, Timing
+from rigidmd.dynamics.step_parts import StepParts
+from rigidmd.dynamics.step_rows import forces_row
 from rigidmd.dynamics.thermostats import Ramp
 from rigidmd.forces.neighbors.space import volume_of
-from rigidmd.forces.terms import WITH_ENERGIES, TermTable, compute_load, copy
+from rigidmd.forces.terms import FORCES_ONLY, WITH_ENERGIES, copy
 
 #: Components of strains and pressures, in this order: (row, column) of the lower triangle.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))
@@ -70,7 +71,7 @@ class BarostatWorkspace(NamedTuple):
     velocity: np.ndarray
     cell: np.ndarray
     load: Load
-    known: np.ndarray  # (1,) whether tally[0] belongs to `load`
+    is_moved: np.ndarray  # (1,) int64, whether a trial move has been made
     counts: np.ndarray  # (2,) moves tried, accepted
 
 
@@ -92,117 +93,78 @@ class Barostat(Protocol):
     """The record of a barostat, a NamedTuple."""
 
     @property
-    def tallies(self) -> int:
-        """What `compute_load` has to compute in a step in which it acts, WITH_VIRIALS or
-        WITH_ENERGIES."""
+    def forces(self) -> int:
+        """What each evaluation of forces computes: FORCES_ONLY or WITH_VIRIALS."""
         ...
 
-    def passes(self, state: State, registers: Registers) -> dict[int, Pass]:
-        """Kind of a flow -> its pass, for flows in addition to BAROSTAT."""
+    def rows(self, parts: StepParts, timing: Timing, when: int) -> list[Pass]:
+        """Its flow in a step. What `forces` computes is known before it, and energies and virials
+        where this is FORCES_ONLY."""
         ...
-
-
-def needed_tallies(barostat: Barostat | None) -> int:
-    """What `compute_load` has to compute in a step in which a barostat acts; 0: no more than in
-    other steps."""
-    return 0 if barostat is None else barostat.tallies
 
 
 @kernel(inline=True)
-def compute_step_load(terms, state, load, registers, flows, which):
-    """Forces and torques at the current positions. A status code.
-
-    which : FORCES_ONLY or WITH_ENERGIES (and virials). A step in which the barostat acts always
-        computes virials, and energies if the move depends on them
-    """
-    registers.known[0] = 0
-    if flows.tallies != 0:
-        for k in range(len(flows.kind)):
-            if (
-                flows.kind[k] == BAROSTAT
-                and (state.step[NOW] - state.step[ORIGIN] + 1) % flows.every[k] == 0
-            ):
-                needed = which if which == WITH_ENERGIES else flows.tallies
-                return compute_load_and_virial(terms, state, load, registers, needed)
-    return compute_load(terms, state, load, which)
+def keep_tally(terms, workspace, registers):
+    """Sum energies and virials of the current positions into tally[0], unless they are there."""
+    if registers.known[0] & KEPT_BY_BAROSTAT == 0:
+        for k in range(TALLY_SIZE):
+            workspace.tally[0, k] = 0.0
+            for tally in terms.tallies:
+                workspace.tally[0, k] += tally[k]
+        registers.known[0] |= KEPT_BY_BAROSTAT
 
 
-@kernel(inline=True)
-def compute_load_and_virial(terms, state, load, workspace, which):
-    """Forces, torques and virial at the current positions, with WITH_ENERGIES also energies; a
-    status code. which : WITH_ENERGIES or WITH_VIRIALS"""
-    status = compute_load(terms, state, load, which)
-    for k in range(TALLY_SIZE):
-        workspace.tally[0, k] = 0.0
-        for tally in terms.tallies:
-            workspace.tally[0, k] += tally[k]
-    workspace.known[0] = 1 if status == OK else 0
-    return status
-
-
-@chosen_by_type
-def apply_barostat(barostat, model, terms, state, load, workspace, progress, h, draw):
-    """The flow of a barostat over a time h, in place. A status code. progress : see `registers`."""
-    return None
+def rows_of_moves(barostat: NamedTuple, parts: StepParts, timing: Timing, when: int) -> list[Pass]:
+    """Trial moves, by `propose_strain` and `rescale_velocities`, and their Metropolis test with
+    `log_acceptance`."""
+    content = (
+        barostat,
+        parts.model,
+        parts.terms,
+        parts.state,
+        parts.load,
+        parts.barostat,
+        parts.registers,
+        timing,
+    )
+    name = f"barostat {type(barostat).__name__} {timing.fraction:.4g} dt"
+    return [
+        Pass(f"{name}: trial move of the box", _try_move, content, when=when),
+        forces_row(parts, WITH_ENERGIES, when),
+        Pass("accept it, or move the box back", _test_move, content, when=when),
+    ]
 
 
 @task()
-def _apply_barostat(arguments, block):
-    barostat, model, terms, state, load, workspace, registers, status = load_arguments(arguments)
-    h, draw = registers.h[0], registers.draw[0]
-    status[0] = apply_barostat(
-        barostat, model, terms, state, load, workspace, registers.progress, h, draw
-    )
-
-
-def barostat_passes(
-    barostat: Barostat,
-    model: NamedTuple,
-    terms: TermTable,
-    state: State,
-    load: Load,
-    workspace: BarostatWorkspace,
-    registers: Registers,
-    status: np.ndarray,
-) -> dict[int, Pass]:
-    """Kind of a flow -> its pass: `apply_barostat` over the time in the registers, and others."""
-    arguments = (barostat, model, terms, state, load, workspace, registers, status)
-    return {
-        BAROSTAT: Pass("barostat", _apply_barostat, arguments),
-        **barostat.passes(state, registers),
-    }
-
-
-def try_move(barostat, model, terms, state, load, workspace, progress, h, draw):
-    """`apply_barostat` by a trial move: `propose_strain`, `rescale_velocities`, and the Metropolis
-    test with `log_acceptance`."""
-    if progress[TRIAL] == 0:
-        if progress[LOADED] == 0 or workspace.known[0] == 0:
-            progress[LOADED] = 0
-            status = compute_load_and_virial(terms, state, load, workspace, WITH_ENERGIES)
-            if status != OK:
-                return status
-        progress[LOADED] = 1
-        if not propose_strain(barostat, model, state, workspace, h, draw):
-            workspace.counts[0] += 1
-            return OK
+def _try_move(arguments, block):
+    """Keep the state, and make a trial move of the box if it is possible."""
+    barostat, model, terms, state, load, workspace, registers, timing = load_arguments(arguments)
+    keep_tally(terms, workspace, registers)
+    h = timing.fraction * timing.dt[0]
+    workspace.is_moved[0] = propose_strain(barostat, model, state, workspace, h, timing.draw)
+    if workspace.is_moved[0] != 0:
         copy_moved(state, load, workspace, workspace.load, workspace.tally[0], workspace.tally[1])
         apply_strain(barostat, state, workspace)
-        progress[TRIAL] = 1
-    status = compute_load_and_virial(terms, state, load, workspace, WITH_ENERGIES)
-    if status != OK:
-        return status
-    progress[TRIAL] = 0
-    chance = log_acceptance(barostat, model, state, workspace, h)
-    u, _ = uniforms(barostat.key, draw + 8, 0, state.step[NOW])
+        registers.known[0] = 0
+
+
+@task()
+def _test_move(arguments, block):
+    """Accept a trial move, or return to the state before it."""
+    barostat, model, terms, state, load, workspace, registers, timing = load_arguments(arguments)
     workspace.counts[0] += 1
+    if workspace.is_moved[0] == 0:
+        return
+    keep_tally(terms, workspace, registers)
+    chance = log_acceptance(barostat, model, state, workspace, timing.fraction * timing.dt[0])
+    u, _ = uniforms(barostat.key, timing.draw + 8, 0, state.step[NOW])
     if log(u) < chance:
         workspace.counts[1] += 1
         state.energy_ledger[WORK] += energy_gained(barostat, model, state, workspace)
     else:
         copy_moved(workspace, workspace.load, state, load, workspace.tally[1], workspace.tally[0])
         terms.tallies_valid[0] = 0
-    return OK
+        registers.known[0] = FORCES_ONLY | KEPT_BY_BAROSTAT
 
 
 @kernel(inline=True)

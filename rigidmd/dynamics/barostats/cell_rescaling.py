@@ -7,27 +7,27 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import Pass, implements, kernel
-from rigidmd.core.state import NOW, State
+from rigidmd.core.state import NOW
 from rigidmd.dynamics.barostats import (
     COMPONENTS,
     COUPLINGS,
     LONGEST_DRIFT,
     Confinement,
     Pressure,
-    apply_barostat,
     energy_gained,
     log_acceptance,
     propose_strain,
     rescale_velocities,
+    rows_of_moves,
     set_matrices,
     target_pressure,
-    try_move,
 )
 from rigidmd.dynamics.noise import Key, normals
-from rigidmd.dynamics.registers import Registers
+from rigidmd.dynamics.registers import Timing
+from rigidmd.dynamics.step_parts import StepParts
 from rigidmd.dynamics.thermostats import Ramp, ramp_value
 from rigidmd.forces.neighbors.space import volume_of
-from rigidmd.forces.terms import WITH_ENERGIES
+from rigidmd.forces.terms import FORCES_ONLY
 from rigidmd.scene.stage import Stage
 
 
@@ -45,10 +45,10 @@ class CellRescaling(NamedTuple):
     tail: tuple[float, float]  # dispersion beyond the cutoff: energy times V, pressure times V²
     key: Key
 
-    tallies = WITH_ENERGIES
+    forces = FORCES_ONLY
 
-    def passes(self, state: State, registers: Registers) -> dict[int, Pass]:
-        return {}
+    def rows(self, parts: StepParts, timing: Timing, when: int) -> list[Pass]:
+        return rows_of_moves(self, parts, timing, when)
 
 
 def barostat(stage: Stage, confinement: Confinement) -> CellRescaling:
@@ -61,9 +61,6 @@ def barostat(stage: Stage, confinement: Confinement) -> CellRescaling:
         confinement.tail,
         confinement.key,
     )
-
-
-implements(apply_barostat, CellRescaling)(try_move)
 
 
 @implements(propose_strain, CellRescaling)

@@ -4,24 +4,24 @@ from math import log, sqrt
 from typing import NamedTuple
 
 from rigidmd.compile import Pass, implements
-from rigidmd.core.state import NOW, State
+from rigidmd.core.state import NOW
 from rigidmd.dynamics.barostats import (
     Confinement,
     Pressure,
-    apply_barostat,
     energy_gained,
     log_acceptance,
     propose_strain,
     rescale_velocities,
+    rows_of_moves,
     set_matrices,
     target_pressure,
-    try_move,
 )
 from rigidmd.dynamics.noise import Key, uniforms
-from rigidmd.dynamics.registers import Registers
+from rigidmd.dynamics.registers import Timing
+from rigidmd.dynamics.step_parts import StepParts
 from rigidmd.dynamics.thermostats import Ramp, ramp_value
 from rigidmd.forces.neighbors.space import volume_of
-from rigidmd.forces.terms import WITH_ENERGIES
+from rigidmd.forces.terms import FORCES_ONLY
 from rigidmd.scene.stage import Stage
 
 #: Largest change of the volume in a Monte Carlo move, in standard deviations of its fluctuations.
@@ -42,10 +42,10 @@ class VolumeMoves(NamedTuple):
     tail: tuple[float, float]
     key: Key
 
-    tallies = WITH_ENERGIES
+    forces = FORCES_ONLY
 
-    def passes(self, state: State, registers: Registers) -> dict[int, Pass]:
-        return {}
+    def rows(self, parts: StepParts, timing: Timing, when: int) -> list[Pass]:
+        return rows_of_moves(self, parts, timing, when)
 
 
 def barostat(stage: Stage, confinement: Confinement) -> VolumeMoves:
@@ -58,9 +58,6 @@ def barostat(stage: Stage, confinement: Confinement) -> VolumeMoves:
         confinement.tail,
         confinement.key,
     )
-
-
-implements(apply_barostat, VolumeMoves)(try_move)
 
 
 @implements(propose_strain, VolumeMoves)

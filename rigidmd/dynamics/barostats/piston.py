@@ -5,17 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import Pass, implements, kernel, load_arguments, task
-from rigidmd.core.integrators import SCALE_BOX
-from rigidmd.core.state import OK, WORK, State
-from rigidmd.dynamics.barostats import (
-    Confinement,
-    Pressure,
-    apply_barostat,
-    compute_load_and_virial,
-    target_pressure,
-)
-from rigidmd.dynamics.registers import LOADED, Registers
+from rigidmd.compile import Pass, kernel, load_arguments, task
+from rigidmd.core.state import WORK
+from rigidmd.dynamics.barostats import Confinement, Pressure, keep_tally, target_pressure
+from rigidmd.dynamics.registers import Timing
+from rigidmd.dynamics.step_parts import EVERY, StepParts
 from rigidmd.dynamics.thermostats import scale_array, translational_energy
 from rigidmd.forces.neighbors.space import volume_of
 from rigidmd.forces.terms import WITH_VIRIALS
@@ -39,10 +33,26 @@ class Piston(NamedTuple):
     tail: tuple[float, float]
 
     variables = 1  # how many numbers it has in `state.extra_variables`
-    tallies = WITH_VIRIALS
+    forces = WITH_VIRIALS
 
-    def passes(self, state: State, registers: Registers) -> dict[int, Pass]:
-        return {SCALE_BOX: Pass("volume", _move_piston, (self, state, registers))}
+    def rows(self, parts: StepParts, timing: Timing, when: int) -> list[Pass]:
+        content = (
+            self,
+            parts.model,
+            parts.terms,
+            parts.state,
+            parts.barostat,
+            parts.registers,
+            timing,
+        )
+        text = f"barostat Piston {timing.fraction:.4g} dt: kick of the volume"
+        return [Pass(text, _kick_piston, content, when=when)]
+
+    def volume_row(self, parts: StepParts, timing: Timing) -> Pass:
+        """The change of the volume by its inertia."""
+        content = self, parts.state, parts.registers, timing
+        text = f"drift of the volume {timing.fraction:.4g} dt"
+        return Pass(text, _move_piston, content, when=EVERY)
 
 
 def barostat(stage: Stage, confinement: Confinement) -> Piston:
@@ -55,13 +65,11 @@ def barostat(stage: Stage, confinement: Confinement) -> Piston:
     )
 
 
-@implements(apply_barostat, Piston)
-def _kick_piston(barostat, model, terms, state, load, workspace, progress, h, draw):
-    if progress[LOADED] == 0 or workspace.known[0] == 0:
-        status = compute_load_and_virial(terms, state, load, workspace, WITH_VIRIALS)
-        if status != OK:
-            return status
-        progress[LOADED] = 1
+@task()
+def _kick_piston(arguments, block):
+    barostat, model, terms, state, workspace, registers, timing = load_arguments(arguments)
+    keep_tally(terms, workspace, registers)
+    h = timing.fraction * timing.dt[0]
     volume = volume_of(state.cell)
     virial = workspace.tally[0, 1] + workspace.tally[0, 5] + workspace.tally[0, 9]
     momenta = 2 * barostat.exponent * translational_energy(model, state)
@@ -71,7 +79,6 @@ def _kick_piston(barostat, model, terms, state, load, workspace, progress, h, dr
     state.energy_ledger[WORK] -= (
         0.5 * barostat.inverse_mass * (state.extra_variables[-1] ** 2 - before**2)
     )
-    return OK
 
 
 @kernel
@@ -88,6 +95,6 @@ def move_piston(barostat, state, h):
 
 @task()
 def _move_piston(arguments, block):
-    barostat, state, registers = load_arguments(arguments)
-    move_piston(barostat, state, registers.h[0])
-    registers.progress[LOADED] = 0
+    barostat, state, registers, timing = load_arguments(arguments)
+    move_piston(barostat, state, timing.fraction * timing.dt[0])
+    registers.known[0] = 0

@@ -1,4 +1,4 @@
-"""Thermostats: flows on the momenta that keep a temperature, each a pass of the step. NVE has none.
+"""Thermostats: flows on the momenta that keep a temperature, each a row of the step. NVE has none.
 
 `apply_thermostat` acts where a scheme has the flow THERMOSTAT. The heat that a thermostat adds is
 summed in `state.energy_ledger[HEAT]`, its own variables are in `state.extra_variables`. Its random
@@ -24,7 +24,8 @@ from rigidmd.compile import (
 )
 from rigidmd.core.state import EXAMPLE, HEAT, NOW, ORIGIN, State
 from rigidmd.dynamics.model import Model
-from rigidmd.dynamics.registers import Registers
+from rigidmd.dynamics.registers import Timing
+from rigidmd.dynamics.step_parts import StepParts
 from rigidmd.forces.neighbors.sites import blocks_of, molecules_of_block
 from rigidmd.mechanics.batches import LANES, kinetic_energies, scale_group
 
@@ -112,22 +113,16 @@ def apply_thermostat(thermostat, model, code, state, workspace, h, draw):
 
 @task()
 def _apply_thermostat(arguments, block):
-    thermostat, model, code, state, workspace, registers = load_arguments(arguments)
-    apply_thermostat(thermostat, model, code, state, workspace, registers.h[0], registers.draw[0])
+    thermostat, model, code, state, workspace, timing = load_arguments(arguments)
+    h = timing.fraction * timing.dt[0]
+    apply_thermostat(thermostat, model, code, state, workspace, h, timing.draw)
 
 
-def thermostat_pass(
-    thermostat: NamedTuple,
-    model: NamedTuple,
-    code: Code,
-    state: State,
-    workspace: np.ndarray,
-    registers: Registers,
-) -> Pass:
-    """`apply_thermostat` over the time in the registers. code : with `thermostat_code`"""
-    return Pass(
-        "thermostat", _apply_thermostat, (thermostat, model, code, state, workspace, registers)
-    )
+def thermostat_row(thermostat: NamedTuple, parts: StepParts, timing: Timing, when: int) -> Pass:
+    """`apply_thermostat` in a step."""
+    content = thermostat, parts.model, parts.code, parts.state, parts.heat, timing
+    text = f"thermostat {type(thermostat).__name__} {timing.fraction:.4g} dt"
+    return Pass(text, _apply_thermostat, content, when=when)
 
 
 def apply_by_molecule(thermostat, model, code, state, workspace, h, draw):

@@ -23,6 +23,7 @@ from rigidmd.core.state import (
     TALLY_SIZE,
     Load,
     State,
+    copy_into,
     no_load,
 )
 from rigidmd.engines.protocol import Engine, NotFiniteError, Tally, keep_time
@@ -86,8 +87,6 @@ class CompiledEngine(Engine, Generic[ModelT, Bound]):
 
     is_repeatable = True
     model: ModelT
-    #: Owners of arrays in `memory` besides the terms.
-    _owners: tuple[str, ...] = (LOAD,)
 
     def __init__(
         self,
@@ -231,11 +230,6 @@ class CompiledEngine(Engine, Generic[ModelT, Bound]):
         for name, array in memory.items():
             owner, _, key = name.rpartition(".")
             arrays_of.setdefault(owner, {})[key] = array
-        if unknown := arrays_of.keys() - {*self.names, *self._owners}:
-            raise ValueError(
-                f"an engine of {', '.join(self.names)} has no memory of"
-                f" {', '.join(sorted(unknown))}"
-            )
         self._recall_lists(state, arrays_of)
         self.load, self._last = no_load(state), LastAdvance(is_current=LOAD in arrays_of)
         self._dispatchers.pop("steps", None)  # its energies belong to another state
@@ -246,8 +240,7 @@ class CompiledEngine(Engine, Generic[ModelT, Bound]):
             self._check_recalled(state, arrays_of)
 
     def _recall_couplings(self, state: State, arrays_of: dict[str, dict[str, np.ndarray]]) -> None:
-        """Make what thermostat, barostat and trajectories remember, with the arrays that were
-        kept."""
+        """Make what the rows of the step remember, with the arrays that were kept."""
 
     def _recall_lists(self, state: State, arrays_of: dict[str, dict[str, np.ndarray]]) -> None:
         """Make new workspaces, with the neighbour lists that were kept: all of them or none."""
@@ -363,16 +356,3 @@ def _are_same(objects: tuple, others: tuple) -> bool:
     return len(objects) == len(others) and all(
         one is other for one, other in zip(objects, others, strict=True)
     )
-
-
-def copy_into(arrays: NamedTuple, sources: dict[str, np.ndarray]) -> None:
-    """Copy kept arrays into the arrays of a tuple. Raises ValueError if they do not fit."""
-    for name, array in sources.items():
-        target = getattr(arrays, name)
-        if (target.shape, target.dtype) != (array.shape, array.dtype):
-            raise ValueError(
-                f"{name} has the shape {array.shape}, not {target.shape}, or is of another type"
-            )
-        if not np.isfinite(array).all():
-            raise ValueError(f"{name} is not finite")
-        target[:] = array

@@ -9,33 +9,26 @@ from rigidmd.compile import Rows, compile_together, set_threads
 from rigidmd.compile.kernels import CompileError
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme
-from rigidmd.core.state import BEHIND_WALL, Load, State
-from rigidmd.dynamics.barostats import barostat_workspace
+from rigidmd.core.state import BEHIND_WALL, Load, State, copy_into
+from rigidmd.dynamics.barostats import BarostatWorkspace, barostat_workspace
 from rigidmd.dynamics.force_gradient import gradient_workspace
 from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.observables import LargestValues, StateSums
-from rigidmd.dynamics.step_loop import Advance, CouplingWorkspaces
+from rigidmd.dynamics.registers import KEPT_BY_BAROSTAT, KEPT_BY_EXTENSION, new_registers
+from rigidmd.dynamics.step_loop import Advance
+from rigidmd.dynamics.step_parts import StepExtension, StepParts, extension_of
 from rigidmd.dynamics.thermostats import thermostat_workspace
-from rigidmd.engines.cpu.compiled import (
-    LOAD,
-    ROUNDING,
-    CompiledEngine,
-    Steps,
-    copy_into,
-)
+from rigidmd.engines.cpu.compiled import CompiledEngine, Steps
 from rigidmd.engines.protocol import Tally
 from rigidmd.errors import SimulationError
-from rigidmd.features.monte_carlo.trajectories import trajectory_workspace
 from rigidmd.forces.fields.walls import LennardJonesWalls
-from rigidmd.forces.terms import Setup, TermDispatcher
+from rigidmd.forces.terms import Setup, TermDispatcher, trait
 
 __all__ = ["BehindWallError", "CompileError", "CpuEngine", "Precision"]
 
 Precision = Literal["double", "mixed"]
-#: Owners of arrays in `Engine.memory`: the arrays of a barostat, and of hybrid Monte Carlo.
-BOX, TRAJECTORY = "box", "trajectory"
-BOX_FIELDS = ("tally", "known", "counts")
-TRAJECTORY_FIELDS = ("energies", "known", "sums")
+#: Owners of arrays in `Engine.memory`: the arrays of a barostat, and of an extension of the step.
+BOX, EXTENSION = "box", "trajectory"
 DTYPES = {"double": np.float64, "mixed": np.float32}
 
 
@@ -51,8 +44,6 @@ class CpuEngine(CompiledEngine[Model, Advance]):
         only
     """
 
-    _owners = (LOAD, BOX, TRAJECTORY)
-
     def __init__(
         self,
         model: Model,
@@ -66,17 +57,19 @@ class CpuEngine(CompiledEngine[Model, Advance]):
         setup = Setup(np.zeros((3, 3)), DTYPES[precision], skin, needs_virials)
         super().__init__(model, terms, setup, python_forces)
         self.threads = threads
-        self._couplings = CouplingWorkspaces(thermostat_workspace(), None, None)
+        self._registers = new_registers()
+        # what thermostat, barostat and extension of a step remember, from their first use
+        self._heat = thermostat_workspace()
+        self._barostat: BarostatWorkspace | None = None
+        self._extension: tuple[StepExtension, tuple] | None = None
+        self._extension_arrays: dict[str, np.ndarray] = {}  # from a checkpoint
 
     def _move(
         self, state: State, load: Load, integrator: Scheme, workspaces: tuple, step: Steps
     ) -> bool:
-        model = self.model_for(integrator)
-
         def new_advance(dispatcher: TermDispatcher) -> Advance:
-            couplings = self._couplings_of(integrator, state)
-            gradient = gradient_workspace(state) if integrator.has_gradient else None
-            return Advance(integrator, model, state, load, dispatcher.table, couplings, gradient)
+            parts = self.step_parts(integrator, state, load)
+            return Advance(integrator, parts._replace(terms=dispatcher.table))
 
         if "steps" not in self._dispatchers:
             self._compile(lambda: new_advance(self._new_dispatcher("steps", workspaces)))
@@ -85,27 +78,47 @@ class CpuEngine(CompiledEngine[Model, Advance]):
             (self.model, integrator, state, load, dispatcher), lambda: new_advance(dispatcher)
         )
         advance.begin(*step, self._last.is_current)
-        other = advance.gradient and advance.gradient.load
-        dispatcher.bind(workspaces, state, load, other)
+        dispatcher.bind(workspaces, state, load, advance.other_load)
         while status := advance():
-            dispatcher.bind(self._handle_status(status, state), state, load, other)
+            workspaces = self._handle_status(status, state)
+            dispatcher.bind(workspaces, state, load, advance.other_load)
         return advance.loaded
 
-    def _couplings_of(self, integrator: Scheme, state: State) -> CouplingWorkspaces:
-        """What thermostat, barostat and trajectories of an integrator remember. Made at their first
-        use."""
-        heat, box, trajectory = self._couplings
-        if integrator.barostat is not None:
-            box = box or barostat_workspace(state)
-        if integrator.trajectory_steps:
-            trajectory = trajectory or trajectory_workspace(state)
-        elif trajectory is not None:
-            trajectory.known[0] = 0  # another integrator moves the state
-        self._couplings = CouplingWorkspaces(heat, box, trajectory)
-        used = self._couplings
-        if integrator.barostat is None:
-            used = used._replace(box=None)
-        return used if integrator.trajectory_steps else used._replace(trajectory=None)
+    def step_parts(self, scheme: Scheme, state: State, load: Load) -> StepParts:
+        """What the rows of a scheme read and write, without the terms."""
+        if scheme.barostat is not None:
+            self._barostat = self._barostat or barostat_workspace(state)
+        extension = None
+        if scheme.has_groups:
+            extension = self._workspace_of(extension_of(scheme), state)
+            self._extension = extension_of(scheme), extension
+        else:
+            self._registers.resting[0] = 0
+            if self._extension is not None:
+                self._extension[0].forget(self._extension[1])
+        return StepParts(
+            model=self.model_for(scheme),
+            state=state,
+            load=load,
+            registers=self._registers,
+            status=np.zeros(1, np.int64),
+            heat=self._heat,
+            has_rates=any(trait(term, "time_dependent") for term in self.terms.values()),
+            barostat=None if scheme.barostat is None else self._barostat,
+            gradient=gradient_workspace(state) if scheme.has_gradient else None,
+            extension=extension,
+        )
+
+    def _workspace_of(self, extension: StepExtension, state: State) -> tuple:
+        """The workspace of an extension; at the first use, with the arrays that were kept."""
+        if self._extension is not None:
+            return self._extension[1]
+        if not self._extension_arrays:
+            return extension.workspace(state)
+        workspace = extension.restored(state, self._extension_arrays)
+        if extension.keeps_energy(workspace):
+            self._registers.known[0] |= KEPT_BY_EXTENSION
+        return workspace
 
     def evaluate_current(self, state: State) -> tuple[Load, dict[str, Tally]]:
         moving = self._dispatchers.get("steps")
@@ -132,28 +145,30 @@ class CpuEngine(CompiledEngine[Model, Advance]):
         return self._bound[1].extent
 
     def _memory_by_owner(self) -> dict[str, dict[str, np.ndarray]]:
-        """The arrays of terms, and the memory of barostat and trajectories."""
+        """The arrays of terms, and the memory of the barostat and of the extension."""
         arrays_of = super()._memory_by_owner()
-        if (box := self._couplings.box) is not None:
-            arrays_of[BOX] = {key: getattr(box, key) for key in BOX_FIELDS}
-        if (trajectory := self._couplings.trajectory) is not None:
-            arrays_of[TRAJECTORY] = {key: getattr(trajectory, key) for key in TRAJECTORY_FIELDS}
+        if (box := self._barostat) is not None:
+            known = self._registers.known & KEPT_BY_BAROSTAT != 0
+            arrays_of[BOX] = {
+                "tally": box.tally,
+                "known": known.astype(np.int64),
+                "counts": box.counts,
+            }
+        if self._extension is not None:
+            extension, workspace = self._extension
+            arrays_of[EXTENSION] = extension.arrays(workspace)
+        elif self._extension_arrays:
+            arrays_of[EXTENSION] = self._extension_arrays
         return arrays_of
 
     def _recall_couplings(self, state: State, arrays_of: dict[str, dict[str, np.ndarray]]) -> None:
-        heat, box, trajectory = self._couplings
+        known = self._registers.known
+        known[0] = 0
         if BOX in arrays_of:
-            box = barostat_workspace(state)
-            copy_into(box, arrays_of[BOX])
-            if box.known[0] not in (0, 1) or not 0 <= box.counts[1] <= box.counts[0]:
-                raise ValueError("the numbers of tried and accepted moves of the box are invalid")
-        if TRAJECTORY in arrays_of:
-            trajectory = trajectory_workspace(state)
-            copy_into(trajectory, arrays_of[TRAJECTORY])
-            ended, accepted = trajectory.sums[:2]
-            if trajectory.known[0] not in (0, 1) or not 0 <= accepted <= ended:
-                raise ValueError("the numbers of ended and accepted trajectories are invalid")
-        self._couplings = CouplingWorkspaces(heat, box, trajectory)
+            self._barostat, arrays = barostat_workspace(state), dict(arrays_of[BOX])
+            known |= KEPT_BY_BAROSTAT * (arrays.pop("known") != 0)
+            copy_into(self._barostat, arrays)
+        self._extension, self._extension_arrays = None, arrays_of.get(EXTENSION, {})
 
     def _check_lists(
         self,
@@ -161,34 +176,24 @@ class CpuEngine(CompiledEngine[Model, Advance]):
         arrays_of: dict[str, dict[str, np.ndarray]],
         tallies: dict[str, Tally],
     ) -> None:
-        if BOX not in arrays_of and TRAJECTORY not in arrays_of:
+        if BOX not in arrays_of and EXTENSION not in arrays_of:
             super()._check_lists(state, arrays_of, tallies)
-            return
-        rounding = ROUNDING[self._setup.dtype]
-        terms = np.array([[tally.energy, *tally.virial.flat] for tally in tallies.values()])
-        _, box, trajectory = self._couplings
-        first = int(self._setup.needs_virials)  # a piston needs no energies
-        totals = [box.tally[0, first:]] if box is not None and box.known[0] else []
-        totals += (
-            [trajectory.energies[:1]] if trajectory is not None and trajectory.known[0] else []
-        )
-        for values in totals:
-            evaluated_total = terms.sum(0)[first : first + len(values)]
-            if (np.abs(evaluated_total - values) > rounding * np.abs(terms).sum(0).max()).any():
-                raise ValueError("its state has another energy or virial than was kept with it")
-        # they were built for a trial box or the end of a trajectory that was rejected
-        if not self._has_lists(arrays_of):
+        elif not self._has_lists(arrays_of):
+            # they were built for positions to which the state has not moved in the end
             self._recall_lists(state, arrays_of)
 
     @property
     def moves(self) -> tuple[int, int]:
-        if (box := self._couplings.box) is None:
+        if (box := self._barostat) is None:
             return 0, 0
         return int(box.counts[0]), int(box.counts[1])
 
     @property
     def trajectories(self) -> np.ndarray | None:
-        return None if (workspace := self._couplings.trajectory) is None else workspace.sums.copy()
+        if self._extension is None:
+            return None
+        extension, workspace = self._extension
+        return extension.sums(workspace)
 
     def rows_of_steps(self) -> Rows:
         """The rows of the forces of steps, bound to the state that `advance` has moved last."""

@@ -1,37 +1,16 @@
-"""The program of a stage in words: what is done in a step, in which order, on how many blocks."""
+"""The program of a stage in words: what is done in a step and for its forces, in which order, on
+how many blocks, when."""
 
 import time
 from statistics import median
 from typing import NamedTuple
 
 from rigidmd.compile import kernel, run_row
-from rigidmd.core.integrators import (
-    BAROSTAT,
-    BEGIN_TRAJECTORY,
-    DRIFT,
-    END_TRAJECTORY,
-    KICK,
-    REMOVE_MOMENTUM,
-    SCALE_BOX,
-    THERMOSTAT,
-    Flow,
-    Scheme,
-)
-from rigidmd.core.state import State
+from rigidmd.core.integrators import Scheme
+from rigidmd.core.state import State, no_load
+from rigidmd.dynamics.step_table import StepTable
 from rigidmd.engines.cpu.engine import CpuEngine
-from rigidmd.forces.neighbors.sites import blocks_of
 from rigidmd.forces.terms import FORCES_ONLY, WITH_ENERGIES
-
-#: Kinds of flows in addition to kicks and drifts -> what they do.
-FLOWS = {
-    THERMOSTAT: "thermostat",
-    BAROSTAT: "barostat",
-    SCALE_BOX: "volume, by the inertia of the piston",
-    REMOVE_MOMENTUM: "removal of the total momentum",
-    BEGIN_TRAJECTORY: "start of a trajectory: new momenta",
-    END_TRAJECTORY: "end of a trajectory: accepted, or returned to its start",
-}
-EVERY_STEP, FORCES, ENERGIES = "", "without energies", "with energies"
 
 
 @kernel(from_python=True)
@@ -45,34 +24,22 @@ class Row(NamedTuple):
 
     text: str
     blocks: int
-    when: str  # EVERY_STEP, FORCES or ENERGIES
+    when: str  # in words; empty if it acts always
 
 
-def program_of(engine: CpuEngine, state: State, scheme: Scheme) -> list[Row]:
-    """The rows of a step of molecules, in order. Nothing is compiled.
+def program_of_step(engine: CpuEngine, state: State, scheme: Scheme) -> list[Row]:
+    """The rows of a step of molecules, in order. Nothing is compiled."""
+    table = StepTable(scheme, engine.step_parts(scheme, state, no_load(state)))
+    return [Row(one.text, one.blocks, table.words(one.when)) for one in table.passes]
 
-    Forces are evaluated before the first kick after a drift. The last evaluation of a step serves
-    the next one.
-    """
-    blocks = blocks_of(len(state.position))
-    forces = [
-        Row(f"  {name}: {one.text}", one.blocks, _when(one.when))
+
+def program_of_forces(engine: CpuEngine, state: State) -> list[Row]:
+    """The rows of an evaluation of forces, in order. Nothing is compiled."""
+    return [
+        Row(f"{name}: {one.text}", one.blocks, _when(one.when))
         for name, passes in engine.passes(state).items()
         for one in passes
     ]
-    rows: list[Row] = []
-    positions_are_new = False
-    for flow in scheme.flows:
-        if flow.kind == KICK and positions_are_new:
-            rows += [Row("forces at the new positions", 1, EVERY_STEP), *forces]
-            positions_are_new = False
-        rows.append(
-            Row(_describe(flow, scheme), blocks if flow.kind != BAROSTAT else 1, EVERY_STEP)
-        )
-        positions_are_new |= flow.kind == DRIFT
-    if positions_are_new:
-        rows += [Row("forces, with the next step", 1, EVERY_STEP), *forces]
-    return rows
 
 
 #: Steps before a profile, and steps that it measures.
@@ -130,22 +97,8 @@ def describe_profile(profile: Profile) -> str:
 
 def _when(bits: int) -> str:
     if bits & FORCES_ONLY and bits & WITH_ENERGIES:
-        return EVERY_STEP
-    return FORCES if bits & FORCES_ONLY else ENERGIES
-
-
-def _describe(flow: Flow, scheme: Scheme) -> str:
-    """A flow in words."""
-    length = f"{flow.fraction:.4g} dt"
-    if flow.kind == KICK:
-        gradient = ", with the gradient of the force" if flow.gradient else ""
-        return f"kick: momenta, by the forces over {length}{gradient}"
-    if flow.kind == DRIFT:
-        return f"drift: free flight and free rotation over {length}"
-    acts_on = {THERMOSTAT: scheme.thermostat, BAROSTAT: scheme.barostat}.get(flow.kind)
-    name = f" {type(acts_on).__name__}" if acts_on is not None else ""
-    interval = f", in one of {flow.every} steps" if flow.every > 1 else ""
-    return f"{FLOWS[flow.kind]}{name} over {length}{interval}"
+        return ""
+    return "without energies" if bits & FORCES_ONLY else "with energies"
 
 
 def describe_program(rows: list[Row]) -> str:
@@ -155,4 +108,4 @@ def describe_program(rows: list[Row]) -> str:
         f"{k:>4}  {row.text:<{width}} {row.blocks:>6}  {row.when}".rstrip()
         for k, row in enumerate(rows, 1)
     ]
-    return "\n".join([f"{'row':>4}  {'':<{width}} blocks  only", *lines])
+    return "\n".join([f"{'row':>4}  {'':<{width}} blocks  when", *lines])

@@ -7,15 +7,13 @@ import numpy as np
 
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import Load, State
-from rigidmd.dynamics.flows import FlowArrays, flow_arrays
 from rigidmd.dynamics.force_gradient import GradientWorkspace, gradient_workspace
-from rigidmd.dynamics.registers import LOADED, Registers, begin_call, new_registers
 from rigidmd.engines.cpu.compiled import CompiledEngine, Steps
-from rigidmd.features.bodies.step_loop import Body, advance_body
+from rigidmd.features.bodies.step_loop import LOADED, Body, FlowArrays, advance_body, flow_arrays
 from rigidmd.forces.terms import Setup
 
 
-class BodyEngine(CompiledEngine[Body, tuple[FlowArrays, GradientWorkspace | None, Registers]]):
+class BodyEngine(CompiledEngine[Body, tuple[FlowArrays, GradientWorkspace | None, np.ndarray]]):
     """An engine of a single body, which has no pairs and one thread. For the arguments see
     `CompiledEngine`."""
 
@@ -31,14 +29,14 @@ class BodyEngine(CompiledEngine[Body, tuple[FlowArrays, GradientWorkspace | None
     def _move(
         self, state: State, load: Load, integrator: Scheme, workspaces: tuple, step: Steps
     ) -> bool:
-        def bound() -> tuple[FlowArrays, GradientWorkspace | None, Registers]:
+        def bound() -> tuple[FlowArrays, GradientWorkspace | None, np.ndarray]:
             gradient = gradient_workspace(state) if integrator.has_gradient else None
-            return flow_arrays(integrator), gradient, new_registers()
+            return flow_arrays(integrator), gradient, np.zeros(2, np.int64)
 
-        flows, gradient, registers = self._bind((integrator, state, load), bound)
+        flows, gradient, progress = self._bind((integrator, state, load), bound)
         model, (dt, until, _) = self.model_for(integrator), step
-        progress = registers.progress
-        begin_call(progress, is_current=self._last.is_current)
+        # the load of a kick with gradient still belongs to the positions if it did before
+        progress[:] = 0, max(1, progress[LOADED]) if self._last.is_current else 0
         while status := advance_body(
             model, state, load, workspaces, flows, gradient, dt, until, progress
         ):

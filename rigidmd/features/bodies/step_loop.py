@@ -3,22 +3,21 @@ has is compiled."""
 
 from typing import NamedTuple
 
+import numpy as np
+
 from rigidmd.compile import chosen_by_type, implements, is_a, kernel
-from rigidmd.core.integrators import KICK
+from rigidmd.core.integrators import DRIFT, KICK, Scheme
 from rigidmd.core.state import NOW, OK, ORIGIN, WORK
-from rigidmd.dynamics.flows import ORTHOGONALITY_INTERVAL
 from rigidmd.dynamics.force_gradient import (
     GradientWorkspace,
     add_gyration,
     displace,
     evaluate,
-    load_of_kick,
-    needs_forces,
 )
-from rigidmd.dynamics.registers import DONE, LOADED
 from rigidmd.features.bodies.forces.resistance import NoResistance, Resistance, kick_with_resistance
 from rigidmd.forces.terms import compute_body_load, total_power, trait
 from rigidmd.mechanics.free_rotor import (
+    ORTHOGONALITY_INTERVAL,
     DrivenRotor,
     ExactRotor,
     NoRotor,
@@ -42,6 +41,10 @@ from rigidmd.mechanics.translation import (
     translate,
 )
 
+#: Indices of the progress of a step: flows done; whether the load belongs to the current positions
+#: (1), and the load of a kick with gradient too (2).
+DONE, LOADED = 0, 1
+
 
 class Body(NamedTuple):
     """The constant part of a single body, in SI units. The counterpart of `Model` for molecules."""
@@ -52,12 +55,32 @@ class Body(NamedTuple):
     resistance: NoResistance | Resistance = NoResistance()
 
 
+class FlowArrays(NamedTuple):
+    """The kicks and drifts of a scheme as arrays, in their order."""
+
+    kind: np.ndarray  # (flows,) KICK or DRIFT
+    fraction: np.ndarray  # (flows,) of the time step
+    moment: np.ndarray  # (flows,) the sum of the fractions of the drifts up to each flow
+    gradient: np.ndarray | None  # (flows,) of dt²; None (not compiled) where no kick has a gradient
+    last: int  # index of the last drift
+
+
+def flow_arrays(scheme: Scheme) -> FlowArrays:
+    kind = np.array([flow.kind for flow in scheme.flows])
+    fraction = np.array([flow.fraction for flow in scheme.flows])
+    moment = np.cumsum(np.where(kind == DRIFT, fraction, 0.0))
+    last = int(np.flatnonzero(kind == DRIFT)[-1])
+    moment[last:] = 1.0
+    gradient = np.array([flow.gradient for flow in scheme.flows])
+    return FlowArrays(kind, fraction, moment, gradient if scheme.has_gradient else None, last)
+
+
 @kernel(from_python=True)
 def advance_body(model, state, load, terms, flows, gradient_workspace, dt, until, progress):
     """Take steps of dt of a body until state.step is `until`. Returns a status code, after which
     another call continues exactly where this one stopped.
 
-    terms : a tuple of workspaces; flows : see `flows.FlowArrays`; progress : see `registers`
+    terms : a tuple of workspaces; flows : see `FlowArrays`; progress : see DONE
     gradient_workspace : None compiles no kicks with gradients
     """
     while state.step[NOW] < until:
@@ -101,6 +124,28 @@ def advance_body(model, state, load, terms, flows, gradient_workspace, dt, until
         progress[DONE] = 0
         state.step[NOW] += 1
     return OK
+
+
+@kernel
+def needs_forces(progress, gradient, tau):
+    """Whether a kick has to wait for an evaluation of forces.
+
+    progress : see DONE; gradient : the `GradientWorkspace`, or None; tau : of the kick, 0
+    without gradient
+    """
+    if gradient is None:
+        return progress[LOADED] == 0
+    if tau == 0.0 or progress[LOADED] == 0:
+        return progress[LOADED] == 0
+    return progress[LOADED] == 1 or gradient.tau[0] != tau
+
+
+@kernel
+def load_of_kick(load, gradient, tau):
+    """The forces and torques of a kick. For the arguments see `needs_forces`."""
+    if gradient is None:
+        return load
+    return load if tau == 0.0 else gradient.load
 
 
 @chosen_by_type

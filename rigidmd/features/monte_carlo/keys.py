@@ -50,7 +50,7 @@ class HybridMonteCarlo(Thermostat):
         return f"trajectories of {steps:g} step{'s' if steps > 1 else ''}{drawn}"
 
     def joined(self, scheme: Scheme, thermostat: tuple, stage: StageKeys) -> Scheme:
-        return scheme.with_trajectories(thermostat, stage.steps_together)
+        return scheme.with_groups(thermostat, stage.steps_together)
 
 
 METHOD = HybridMonteCarlo()

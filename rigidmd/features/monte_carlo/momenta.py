@@ -18,6 +18,7 @@ from rigidmd.dynamics.thermostats import (
     tasks_by_molecule,
 )
 from rigidmd.dynamics.thermostats.langevin import apply_langevin
+from rigidmd.features.monte_carlo.trajectories import Trajectories
 from rigidmd.scene.stage import Stage
 
 
@@ -30,6 +31,10 @@ class HybridMonteCarlo(NamedTuple):
     friction_translation: float  # 1/ps
     friction_rotation: float  # 1/ps
     key: Key
+
+    @property
+    def extension(self) -> Trajectories:
+        return Trajectories(self)
 
     def tasks(self, model: Model, state: State, workspace: np.ndarray) -> Tasks:
         new_momenta = tasks_by_molecule(apply_langevin, self, model, state, workspace)

@@ -12,13 +12,23 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import Code, Pass, kernel, load_arguments, task
-from rigidmd.core.integrators import BEGIN_TRAJECTORY, END_TRAJECTORY
-from rigidmd.core.state import BEHIND_WALL, HEAT, NOT_FINITE, NOW, OK, Load, State, no_load
+from rigidmd.compile import Pass, kernel, load_arguments, task
+from rigidmd.core.state import (
+    BEHIND_WALL,
+    HEAT,
+    NOT_FINITE,
+    NOW,
+    OK,
+    Load,
+    State,
+    copy_into,
+    no_load,
+)
 from rigidmd.dynamics.noise import uniforms
-from rigidmd.dynamics.registers import AFTER_BAROSTAT, FAILED, LOADED, Registers
+from rigidmd.dynamics.registers import KEPT_BY_EXTENSION, Timing
+from rigidmd.dynamics.step_parts import StepExtension, StepParts
 from rigidmd.dynamics.thermostats import kinetic_energies_of, ramp_value
-from rigidmd.forces.terms import WITH_ENERGIES, TermTable, compute_load, copy
+from rigidmd.forces.terms import FORCES_ONLY, copy
 
 #: Columns of `TrajectoryWorkspace.sums`: trajectories ended and accepted; sums of abs(dH)/kT, of
 #: min(1, exp(-dH/kT)), and of exp(-dH/kT), whose mean is 1 in equilibrium.
@@ -38,142 +48,152 @@ class TrajectoryWorkspace(NamedTuple):
     load: Load
     energies: np.ndarray  # (2,) potential, without constants, and kinetic, u Å²/ps²
     known: np.ndarray  # (1,) whether the potential energy belongs to the current positions
-    # (1,) whether the current trajectory has diverged, so that it rests at its start
-    diverged: np.ndarray
+    is_under_way: np.ndarray  # (1,) whether a trajectory has started and not ended
     sums: np.ndarray  # (5,) see ENDED
 
 
 def trajectory_workspace(state: State) -> TrajectoryWorkspace:
     arrays = (array.copy() for array in state[:4])
-    known, diverged = np.zeros((2, 1), np.int64)
-    return TrajectoryWorkspace(*arrays, no_load(state), np.zeros(2), known, diverged, np.zeros(5))
+    known, is_under_way = np.zeros((2, 1), np.int64)
+    return TrajectoryWorkspace(
+        *arrays, no_load(state), np.zeros(2), known, is_under_way, np.zeros(5)
+    )
 
 
-@kernel
-def potential_energy(terms, state, load, progress):
-    """Status code and potential energy of the current positions, with forces if these are unknown.
-    progress : see `dynamics.step_loop.advance`"""
-    if progress[LOADED] == 0 or terms.tallies_valid[0] == 0:
-        progress[LOADED] = 0
-        status = compute_load(terms, state, load, WITH_ENERGIES)
-        if status != OK:
-            return status, 0.0
-        progress[LOADED] = 1
-    total = 0.0
-    for tally in terms.tallies:
-        total += tally[0]
-    return OK, total
+class Trajectories(StepExtension[TrajectoryWorkspace]):
+    """The rows of trajectories, for the thermostat that draws their momenta."""
+
+    def __init__(self, thermostat: NamedTuple):
+        self.thermostat = thermostat
+
+    def workspace(self, state: State) -> TrajectoryWorkspace:
+        return trajectory_workspace(state)
+
+    def begin(self, parts: StepParts, timing: Timing, when: int) -> list[Pass]:
+        content = (
+            parts.model,
+            parts.code,
+            parts.terms,
+            parts.state,
+            parts.load,
+            parts.heat,
+            parts.extension,
+            parts.registers,
+        )
+        return [Pass("start of a trajectory", _start, content, when=when)]
+
+    def end(self, parts: StepParts, timing: Timing, when: int) -> list[Pass]:
+        content = (
+            self.thermostat,
+            parts.model,
+            parts.code,
+            parts.terms,
+            parts.state,
+            parts.load,
+            parts.heat,
+            parts.extension,
+            parts.registers,
+            timing,
+        )
+        return [Pass("accept the trajectory, or return to its start", _test, content, when=when)]
+
+    def after_barostat(self, parts: StepParts, when: int) -> list[Pass]:
+        content = parts.extension, parts.barostat, parts.registers
+        return [Pass("potential energy in the box", _know_potential, content, when=when)]
+
+    def after_failure(self, parts: StepParts) -> list[Pass]:
+        content = parts.extension, parts.state, parts.load, parts.registers, parts.status
+        return [Pass("rest at the start of the trajectory", _rest, content)]
+
+    def forget(self, workspace: TrajectoryWorkspace) -> None:
+        workspace.known[0] = 0
+
+    def arrays(self, workspace: TrajectoryWorkspace) -> dict[str, np.ndarray]:
+        return {key: getattr(workspace, key) for key in ("energies", "known", "sums")}
+
+    def restored(self, state: State, arrays: dict[str, np.ndarray]) -> TrajectoryWorkspace:
+        workspace = trajectory_workspace(state)
+        copy_into(workspace, arrays)
+        return workspace
+
+    def sums(self, workspace: TrajectoryWorkspace) -> np.ndarray:
+        return workspace.sums.copy()
+
+    def keeps_energy(self, workspace: TrajectoryWorkspace) -> bool:
+        return bool(workspace.known[0])
 
 
-@kernel
-def start_or_test_trajectory(
-    thermostat, model, code, terms, state, load, blocks, workspace, registers, starts, draw
-):
-    """Keep the current state as the start of a trajectory, or accept it as its end, or return to
-    the start. A status
-    code. blocks : see `thermostat_workspace`"""
-    progress = registers.progress
-    potential = workspace.energies[0]
-    if not starts or workspace.known[0] == 0 or progress[LOADED] == 0:
-        status, potential = potential_energy(terms, state, load, progress)
-        if not starts and diverges(workspace, status):
-            rest_at_start(workspace, state, load)
-        elif status != OK:
-            return status
+@task()
+def _start(arguments, block):
+    """Keep the current state as the start of a trajectory."""
+    model, code, terms, state, load, blocks, workspace, registers = load_arguments(arguments)
+    if registers.known[0] & KEPT_BY_EXTENSION == 0:
+        workspace.energies[0] = potential_energy(terms)
     moving, turning = kinetic_energies_of(model, code, state, blocks)
-    kinetic = moving + turning
-    if starts:
-        workspace.energies[0], workspace.energies[1] = potential, kinetic
-        copy_start(state, load, workspace, workspace.load)
-        return OK
-    gained = potential - workspace.energies[0] + (kinetic - workspace.energies[1])
+    workspace.energies[1] = moving + turning
+    copy_start(state, load, workspace, workspace.load)
+    workspace.is_under_way[0] = 1
+
+
+@task()
+def _test(arguments, block):
+    """Accept the current state as the end of a trajectory, or return to its start."""
+    thermostat, model, code, terms, state, load, blocks, workspace, registers, timing = (
+        load_arguments(arguments)
+    )
+    potential = potential_energy(terms)
+    moving, turning = kinetic_energies_of(model, code, state, blocks)
+    gained = potential - workspace.energies[0] + (moving + turning - workspace.energies[1])
     loss = gained / ramp_value(thermostat.thermal_energy, state)
-    if isnan(loss) or workspace.diverged[0] != 0:
+    if isnan(loss) or registers.resting[0] != 0:
         loss = inf
-    u, _ = uniforms(thermostat.key, draw, 0, state.step[NOW])
+    u, _ = uniforms(thermostat.key, timing.draw, 0, state.step[NOW])
     sums = workspace.sums
     sums[ENDED] += 1
     sums[SIZES] += min(LARGEST, abs(loss))
     sums[CHANCES] += exp(min(0.0, -loss))
     sums[WEIGHTS] += exp(min(LARGEST, -loss))
-    workspace.known[0], workspace.diverged[0] = 1, 0
+    workspace.known[0], workspace.is_under_way[0], registers.resting[0] = 1, 0, 0
     if log(u) < -loss:
         sums[ACCEPTED] += 1
         workspace.energies[0] = potential
         state.energy_ledger[HEAT] += gained
     else:
         copy_start(workspace, workspace.load, state, load)
-        progress[LOADED] = min(1, progress[LOADED])
         negate(state.velocity)
         negate(state.angular_momentum_body)
         terms.tallies_valid[0] = 0
-        registers.known[0] = 0
-    return OK
+        registers.known[0] = FORCES_ONLY
+    registers.known[0] |= KEPT_BY_EXTENSION
 
 
 @kernel
-def diverges(workspace, status):
-    """Whether a status code is the first sign that a trajectory has diverged."""
-    return status in (NOT_FINITE, BEHIND_WALL) and workspace.diverged[0] == 0
-
-
-@kernel
-def rest_at_start(workspace, state, load):
-    workspace.diverged[0] = 1
-    copy_start(workspace, workspace.load, state, load)
-
-
-@task()
-def _start_or_test(arguments, block):
-    everything, registers, status, starts = load_arguments(arguments)
-    status[0] = start_or_test_trajectory(*everything, registers, starts, registers.draw[0])
+def potential_energy(terms):
+    """Potential energy of the last forces, which have energies."""
+    total = 0.0
+    for tally in terms.tallies:
+        total += tally[0]
+    return total
 
 
 @task()
 def _rest(arguments, block):
-    """After forces that failed. If a trajectory diverges, it rests at its start, where the forces
-    are unknown, until it is rejected. The status becomes OK."""
-    workspace, state, load, registers = load_arguments(arguments)
-    if diverges(workspace, registers.failure[0]):
-        rest_at_start(workspace, state, load)
-        registers.progress[LOADED] = 0
-        registers.failure[0] = OK
+    """After forces that failed. If a trajectory diverges, it rests at its start until it is
+    rejected. The status becomes OK."""
+    workspace, state, load, registers, status = load_arguments(arguments)
+    diverges = status[0] in (NOT_FINITE, BEHIND_WALL) and workspace.is_under_way[0] != 0
+    if diverges and registers.resting[0] == 0:
+        registers.resting[0], registers.known[0] = 1, 0
+        copy_start(workspace, workspace.load, state, load)
+        status[0] = OK
 
 
 @task()
 def _know_potential(arguments, block):
     """Take the potential energy from a move of the box that has just been accepted or rejected."""
-    workspace, registers = load_arguments(arguments)
-    workspace.energies[0] = registers.tally[0, 0]
-
-
-def trajectory_passes(
-    thermostat: NamedTuple,
-    model: NamedTuple,
-    code: Code,
-    terms: TermTable,
-    state: State,
-    load: Load,
-    blocks: np.ndarray,
-    workspace: TrajectoryWorkspace,
-    registers: Registers,
-    status: np.ndarray,
-) -> dict[int, Pass]:
-    """Kind of a flow -> its pass: the start and the test of a trajectory. What follows a move of
-    the box, and, as FAILED, what follows forces that failed."""
-    everything = (thermostat, model, code, terms, state, load, blocks, workspace)
-    return {
-        BEGIN_TRAJECTORY: Pass(
-            "start of a trajectory", _start_or_test, (everything, registers, status, True)
-        ),
-        END_TRAJECTORY: Pass(
-            "test of a trajectory", _start_or_test, (everything, registers, status, False)
-        ),
-        AFTER_BAROSTAT: Pass(
-            "potential energy of the box", _know_potential, (workspace, registers)
-        ),
-        FAILED: Pass("rest at the start", _rest, (workspace, state, load, registers)),
-    }
+    workspace, barostat, registers = load_arguments(arguments)
+    workspace.energies[0] = barostat.tally[0, 0]
+    registers.known[0] |= KEPT_BY_EXTENSION
 
 
 @kernel

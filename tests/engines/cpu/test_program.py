@@ -8,9 +8,8 @@ from support.common import ROOT, built, small_scene
 from rigidmd.assemble.build import build, integrator_of_stage
 from rigidmd.commands.cli import main
 from rigidmd.compile import ALWAYS, Pass, Program, kernel, load_arguments, run_passes, task
-from rigidmd.core.integrators import SCHEMES
 from rigidmd.dynamics import step_loop
-from rigidmd.engines.cpu.program import program_of
+from rigidmd.engines.cpu.program import program_of_forces, program_of_step
 from rigidmd.forces.neighbors import update
 from rigidmd.io.scene_file import write_scene
 from rigidmd.run import Simulation
@@ -108,23 +107,18 @@ def test_a_stage_without_a_thermostat_has_no_flow_of_one():
         {"argon": 5}, 20.0, stages=[STAGE, {"ensemble": "nve", "duration_ps": 0.01}]
     )
     texts = [
-        [row.text for row in program_of(engine, state, integrator_of_stage(system, k))]
+        [row.text for row in program_of_step(engine, state, integrator_of_stage(system, k))]
         for k in (0, 1)
     ]
     assert any("thermostat VelocityRescaling" in text for text in texts[0])
     assert not any("thermostat" in text for text in texts[1])
 
 
-def test_the_program_of_a_step_is_in_its_order():
+def test_the_program_of_the_forces_is_in_the_order_of_the_terms():
     _, engine, state = built({"spce": 4, "argon": 3}, 14.0, forces={"cutoff_A": 5.0})
-    rows = program_of(engine, state, SCHEMES["velocity_verlet"])
-    kinds = [row.text.split(":")[0].strip() for row in rows]
-    assert kinds[:3] == ["kick", "drift", "forces at the new positions"]
-    assert kinds[-1] == "kick"
-    assert kinds[3] == "lennard_jones"
+    rows = program_of_forces(engine, state)
+    assert rows[0].text.startswith("lennard_jones: ")
     assert {"with energies", "without energies", ""} == {row.when for row in rows}
-    two_drifts = program_of(engine, state, SCHEMES["position_verlet"])
-    assert [row.text for row in two_drifts].count("forces at the new positions") == 1
 
 
 def test_check_prints_the_program_of_each_stage(tmp_path, printed, monkeypatch):
@@ -157,11 +151,8 @@ def test_check_measures_the_rows_of_a_step(tmp_path, printed):
     )
     rows = [" ".join(line.split()[:-2]) for line in lines[2:] if line.endswith("%")]
     system, engine = build(scene), build(scene).engine()
-    program = program_of(engine, system.state, integrator_of_stage(system, 0))
-    expected = [
-        row.text.strip() for row in program if ": " in row.text and row.when != "with energies"
-    ]
-    assert rows[:-1] == [text for text in expected if not text.startswith(("kick", "drift"))]
+    program = program_of_forces(engine, system.state)
+    assert rows[:-1] == [row.text for row in program if row.when != "with energies"]
     times = [float(line.split()[-2]) for line in lines[2:] if line.endswith("%")]
     assert len(times) > 5
     assert all(spent >= 0 for spent in times)

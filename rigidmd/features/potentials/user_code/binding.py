@@ -12,7 +12,7 @@ from rigidmd.assemble.defaults import with_momentum_removal
 from rigidmd.core.plain_text import did_you_mean, distinct
 from rigidmd.dynamics.model import count_degrees_of_freedom
 from rigidmd.engines.cpu.compiled import LOAD
-from rigidmd.engines.cpu.engine import BOX, TRAJECTORY, CompileError
+from rigidmd.engines.cpu.engine import BOX, EXTENSION, CompileError
 from rigidmd.engines.samples import IN_LOGS
 from rigidmd.engines.system import System, ThermostatOfStages
 from rigidmd.errors import SceneError, describe_error
@@ -45,7 +45,7 @@ from rigidmd.scene.validation import not_none
 
 #: Names that a force cannot have, and what they are.
 RESERVED = {
-    **dict.fromkeys((LOAD, BOX, TRAJECTORY), "the name of a part of checkpoints"),
+    **dict.fromkeys((LOAD, BOX, EXTENSION), "the name of a part of checkpoints"),
     **dict.fromkeys(
         ("tail", "lennard_jones_tail"), "the name of the energy of the tail correction"
     ),
