@@ -6,7 +6,7 @@ module `feature`, a subclass of `Feature`: the core calls its methods for scenes
 feature may be absent: its folder is not there, and a scene that needs it ends with one sentence.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
@@ -38,7 +38,8 @@ class Row:
     #: one value. A scene in which one has a value uses the feature
     keys: tuple[str, ...] = ()
     acts: bool = False  # whether it changes systems: a scene that uses it cannot do without
-    provides: tuple[str, ...] = ()  # methods of its `Feature` that commands of the core call
+    #: Methods of its `Feature` that are called by their name, and not for scenes with its keys
+    provides: tuple[str, ...] = ()
     commands: tuple[str, ...] = ()  # modules of its folder `commands`
     formats: tuple[str, ...] = ()  # modules that register file formats
     analyses: tuple[str, ...] = ()  # modules that register analyses
@@ -115,6 +116,16 @@ class Feature:
     def warning_at(self, system: object, state: object) -> str:
         """A warning at a state in a run, which is given once. Empty without one."""
         return ""
+
+    def shapes(self, system: object) -> Iterator[tuple[str, list[tuple]]]:
+        """(species, its ellipsoids) for species that are drawn with a shape. An ellipsoid has the
+        index of its molecule, offset (3,) and frame (3, 3) in the body, semi-axes (3,) in Å and
+        colour (3,), NaN for one by the direction of its axis."""
+        return iter(())
+
+    def page_parts(self, record: object) -> Iterator[tuple[str, Iterator[str]]]:
+        """(title, HTML texts) of parts of the page of a run."""
+        return iter(())
 
     def draw_model(self, path: Path, molecule: object, *, force: bool) -> None:
         """Write a picture of a molecular model."""

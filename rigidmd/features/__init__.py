@@ -22,12 +22,15 @@ FEATURES = (
         "interactions of users: formula, table, Python function",
         keys=("forces.custom", "forces.bodies", "from_python"),
         acts=True,
+        provides=("shapes",),
     ),
     Row(
         "analysis",
         "analyses of runs",
-        needs=("free_energy", "potentials", "studies", "view"),
+        needs=("free_energy", "potentials", "view"),
         commands=("analyse",),
+        display="display",
+        provides=("page_parts",),
     ),
     Row(
         "free_energy",
@@ -44,6 +47,7 @@ FEATURES = (
         needs=("analysis", "bodies", "free_energy", "potentials", "view"),
         commands=("accuracy", "compare", "modes", "stability", "sweep"),
         display="sweep.notebook",
+        provides=("analyse_sweep",),
     ),
     Row(
         "crystals",
@@ -55,7 +59,7 @@ FEATURES = (
     Row(
         "view",
         "figures, pages, animations, display in notebooks",
-        needs=("analysis", "bodies", "potentials"),
+        needs=("bodies",),
         commands=("film", "gallery", "report", "view"),
         display="notebook",
         keys=("output.figures",),
@@ -94,6 +98,11 @@ def _has(value: object, path: str, wanted: str) -> bool:
         first, _, rest = path.partition(".")
         return _has(getattr(value, first, None), rest, wanted)
     return str(value) == wanted if wanted else bool(value)
+
+
+def providers(method: str) -> Iterator:
+    """The `Feature` of all installed features that provide a method."""
+    return (row.load() for row in FEATURES if method in row.provides and row.is_installed)
 
 
 def provider(method: str, needed_by: str):

@@ -179,7 +179,7 @@ class Results(Displayed):
         IndexError
             If there are fewer frames.
         """
-        from rigidmd.features.calculators.atom_forces import atoms_of_results
+        from rigidmd.run.atom_forces import atoms_of_results
 
         return atoms_of_results(self, frame)
 

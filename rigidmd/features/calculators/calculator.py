@@ -33,13 +33,13 @@ from rigidmd.core.toml import Json
 from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.engines.system import System
 from rigidmd.errors import RigidMDWarning, SceneError, StructureError, describe_error
-from rigidmd.features.calculators.atom_forces import Form, ase_results
 from rigidmd.features.potentials.user_code.force import Force, UserForceError, real_numbers
 from rigidmd.formats import STRUCTURE
 from rigidmd.formats.cells import basis_of, least_skewed_cell, standard_rotation
 from rigidmd.formats.through_ase import EV, atoms_of_sites
 from rigidmd.io.structure_file import read_atoms
 from rigidmd.io.trajectory import read_frames
+from rigidmd.run.atom_forces import Form, ase_results
 from rigidmd.run.minimise import minimise
 from rigidmd.run.record import read_record
 from rigidmd.run.summary import describe_minimum, minimum_figures

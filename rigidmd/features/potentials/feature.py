@@ -1,6 +1,7 @@
 """What [[forces.custom]], [[forces.bodies]] and code of users add to a system. Their modules are
 loaded where they are needed: a stored run needs few of them."""
 
+from collections.abc import Iterator
 from contextlib import AbstractContextManager
 
 from rigidmd.core.state import State
@@ -42,6 +43,11 @@ class Potentials(Feature):
         from rigidmd.features.potentials.user_code.pose_checks import within_table
 
         return within_table(system, state)
+
+    def shapes(self, system: System) -> Iterator[tuple[str, list[tuple]]]:
+        from rigidmd.features.potentials.poses.shapes import shapes_of
+
+        return shapes_of(system)
 
 
 FEATURE = Potentials()

@@ -11,10 +11,8 @@ import numpy as np
 from rigidmd.assemble.describe import describe, describe_system
 from rigidmd.core.display import html as html_of
 from rigidmd.core.files import write_text
-from rigidmd.core.statistics import format_with_error
 from rigidmd.engines.system import System
 from rigidmd.errors import InputError, OutputError
-from rigidmd.features.analysis.result import AnalysisResult, Value
 from rigidmd.features.bodies.animation import BodyAnimation
 from rigidmd.features.bodies.system import BodySystem
 from rigidmd.features.view.figures.run import run_figures
@@ -75,32 +73,16 @@ def results_html(results: Results) -> str:
         iter(run_figures(results.system, results.samples, summary).items()), ("", None)
     )
     left = f"{''.join(text)}{notes(summary['notes'])}"
-    right = _drawing(drawn, f"{name}-{stem}", f"figure: {stem}")
-    return framed(name, results._summary_line, f"{_sides(left, right)}{_columns(results)}")
+    right = drawing_of(drawn, f"{name}-{stem}", f"figure: {stem}")
+    return framed(name, results._summary_line, f"{sides(left, right)}{_columns(results)}")
 
 
-@html_of.register
-def analysis_html(result: AnalysisResult) -> str:
-    rows = [(value.name, _measured(value), value.note) for value in result.values]
-    right = _drawing(
-        result.plot() if result.curves else None, f"analysis-{result.name}", result.about
-    )
-    left = f"{table([], rows, words=True)}{notes(result.notes)}"
-    return framed(result.name, result.about, _sides(left, right))
-
-
-def _measured(value: Value) -> str:
-    """A value with its error and unit. Empty without one, as its note has the reason."""
-    unit = "" if value.unit in ("", "1") else f" {value.unit}"
-    return "" if value.value is None else f"{format_with_error(value.value, value.error)}{unit}"
-
-
-def _sides(left: str, right: str) -> str:
+def sides(left: str, right: str) -> str:
     """Text and figure side by side."""
     return f'<div class="sides"><div>{left}</div>{f"<div>{right}</div>" if right else ""}</div>'
 
 
-def _drawing(drawing: "Picture | None", salt: str, about: str) -> str:
+def drawing_of(drawing: "Picture | None", salt: str, about: str) -> str:
     """A figure in the colours of the notebook, or on white if it has a shaded solid. Empty without
     one."""
     if drawing is None:

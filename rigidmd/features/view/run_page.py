@@ -15,12 +15,10 @@ import numpy as np
 
 from rigidmd.assemble.describe import describe
 from rigidmd.core.shipped import Example, examples
-from rigidmd.core.statistics import format_with_error
 from rigidmd.core.toml import Json
 from rigidmd.engines.samples import BODY
 from rigidmd.errors import InputError
-from rigidmd.features.analysis.curve_figure import curve_figure
-from rigidmd.features.analysis.files import read_results
+from rigidmd.features import providers
 from rigidmd.features.bodies.animation import BodyAnimation
 from rigidmd.features.bodies.summary import motion_figures
 from rigidmd.features.view import plots
@@ -32,7 +30,6 @@ from rigidmd.features.view.page import (
     GOOD,
     Raw,
     code,
-    figure,
     items,
     notes,
     read_asset,
@@ -88,7 +85,9 @@ def parts(record: Record, animation: str = "") -> Iterator[str]:
         yield section("Means of each stage", *_stages(record))
     if not animation:
         yield section("Plots", plots.plots_part(record))
-    yield section("Analyses", *_analyses(record))
+    for feature in providers("page_parts"):
+        for title, texts in feature.page_parts(record):
+            yield section(title, *texts)
     yield section("Stability margins", _margins(record))
     start = lines.index("omitted:") if "omitted:" in lines else len(lines)
     end = next(
@@ -113,37 +112,6 @@ def _stages(record: Record) -> Iterator[str]:
             stage = stage_summary(system, samples, k, ended.get("computing_s", 0.0), moves)
             yield f"<p>{html.escape(stage_title(stage))}</p>"
             yield table([], stage_rows(stage | {"choice": ended.get("choice")}), words=True)
-
-
-def _analyses(record: Record) -> Iterator[str]:
-    """Results of `rigidmd analyse`: values, analyses left out, figures."""
-    rows = []
-    left_out = []
-    figures = []
-    phrases = []
-    for result, phrase in read_results(record.folder):
-        if not result.values and not result.curves:
-            left_out += [f"{result.name}: {note}" for note in result.notes]
-            continue
-        phrases.append(phrase)
-        for value in result.values:
-            if value.value is None:
-                left_out.append(f"{value.name}: {value.note}")
-                continue
-            text = format_with_error(value.value, value.error)
-            time = "" if value.correlation_ps is None else f"{value.correlation_ps:.3g}"
-            unit = "" if value.unit == "1" else value.unit
-            rows.append([value.name, text, unit, time, value.note])
-        for curve in result.curves:
-            svg = figure(curve_figure(curve), f"analysis-{curve.file}", curve.label)
-            caption = html.escape(f"{result.name}: {curve.label}")
-            figures.append(f"<figure>{svg}<figcaption>{caption}</figcaption></figure>")
-    if phrases:
-        text = html.escape("; ".join(dict.fromkeys(phrases)))
-        yield f'<p class="faint">Values ± one standard error, of {text}.</p>'
-    yield table(["", "value", "unit", "correlation time (ps)", "note"], rows, words=True)
-    yield f'<div class="plots">{"".join(figures)}</div>' if figures else ""
-    yield "<p>Skipped:</p>" + items(left_out) if left_out else ""
 
 
 def _body_table(record: Record) -> str:

@@ -1,22 +1,17 @@
-"""Bodies with potentials of two bodies as solids: ellipsoids, and spheres with a patch."""
+"""Molecules as solids: ellipsoids and spheres, where a feature gives them shapes."""
 
 from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.engines.system import System
-from rigidmd.features.potentials.poses.bodies import bodies_of_potentials
-from rigidmd.features.potentials.poses.gay_berne import GayBerne
-from rigidmd.features.potentials.poses.patch import Patch
+from rigidmd.features import providers
 from rigidmd.features.view.molecule_figure import color_of
 from rigidmd.formats.bonds import COVALENT
 from rigidmd.run.rigid_fit import Bodies
 
 #: Colours of ellipsoids along x, y and z; in between they are mixed.
 DIRECTIONS = np.array([[0.80, 0.32, 0.22], [0.20, 0.60, 0.36], [0.20, 0.42, 0.76]])
-BALL, PATCH = np.array([0.72, 0.76, 0.82]), np.array([0.85, 0.35, 0.20])
-#: A patch is a smaller sphere off the centre of the ball: both in the radius of the ball.
-PATCH_RADIUS, PATCH_OFFSET = 0.9, 0.2
 #: Radius of a sphere in covalent radii, by which bonded spheres touch; default radius, Å.
 SPHERE_SCALE, DEFAULT_RADIUS = 1.15, 1.2
 
@@ -47,25 +42,10 @@ def solids_of(system: System) -> Solids | None:
     shape."""
     rows: list[tuple] = []
     drawn: set[str] = set()
-    for bodies in bodies_of_potentials(system):
-        name = bodies.species.name
-        potential = bodies.potential
-        if name in drawn or type(potential.function) not in (GayBerne, Patch):
-            continue
-        drawn.add(name)
-        values = potential.parameters[name]
-        offset = bodies.reference
-        k = "xyz".index(potential.axis or "z")
-        frame = bodies.frame[:, [k - 2, k - 1, k]]
-        for m in bodies.molecule.tolist():
-            if isinstance(potential.function, Patch):
-                radius = values["sigma_A"] / 2
-                rows.append((m, offset, frame, [radius] * 3, BALL))
-                moved = offset + PATCH_OFFSET * radius * frame[:, 2]
-                rows.append((m, moved, frame, [PATCH_RADIUS * radius] * 3, PATCH))
-            else:
-                wide, long = values["width_A"] / 2, values["length_A"] / 2
-                rows.append((m, offset, frame, [wide, wide, long], np.full(3, np.nan)))
+    for feature in providers("shapes"):
+        for name, shapes in feature.shapes(system):
+            drawn.add(name)
+            rows += shapes
     if not rows:
         return None
     sites = system.sites

@@ -21,10 +21,10 @@ import rigidmd
 from rigidmd import BodyScene, MolecularScene, Scene, Simulation
 from rigidmd.assemble.build import build
 from rigidmd.errors import RigidMDWarning, SceneError, StructureError
-from rigidmd.features.calculators.atom_forces import _transfer_matrices
 from rigidmd.features.calculators.calculator import TABLES, WITHOUT_ENERGIES, RigidMD
 from rigidmd.formats.through_ase import EV
 from rigidmd.mechanics.rotation import random_rotations
+from rigidmd.run.atom_forces import _transfer_matrices
 from rigidmd.scene.models import load_model
 from rigidmd.units import FEMTOSECOND, KJ_PER_MOL
 

@@ -99,15 +99,13 @@ class _List(argparse.Action):
 )
 def _analyse(options: Options) -> int:
     from rigidmd.errors import OutputError
+    from rigidmd.features import provider
     from rigidmd.features.analysis.files import analyse_folder
     from rigidmd.features.analysis.registry import run_user_file
     from rigidmd.features.analysis.report import frames_text
     from rigidmd.features.free_energy import estimate as free_energy
     from rigidmd.features.free_energy import mean_force
-    from rigidmd.features.studies.commands.sweep import print_limits
-    from rigidmd.features.studies.sweep.folder import is_sweep, read_manifest
-    from rigidmd.features.studies.sweep.replicas import ANALYSES, analyse_sweep
-    from rigidmd.io.folder import check_is_run
+    from rigidmd.io.folder import SWEEP, check_is_run
     from rigidmd.scene import parse_override
 
     for path in options.trust:
@@ -119,22 +117,9 @@ def _analyse(options: Options) -> int:
     with progress_bar() as progress:
         folder = Path(options.folder)
         request = (names, options.start, options.viscosity)
-        if is_sweep(folder):
-            analysed = analyse_sweep(folder, *request, progress, options.figures, more)
-            progress(1.0, "")
-            for of in analysed:
-                runs = f"{of.runs} run{'s' if of.runs > 1 else ''}"
-                files = (
-                    f"{len(of.files)} files in {of.files[0].parent}" if of.files else "no results"
-                )
-                print(f"{of.title or folder}: {runs}, {files}")
-                _print_results(of.results, of.failed, verbose=options.verbose)
-                print()
-            print(f"values of all in {folder / ANALYSES}")
-            if options.extrapolate is not None:
-                files = print_limits(read_manifest(folder), options.extrapolate)
-                print(f"\n  files in {folder}: {', '.join(files)}")
-            return FAILED if names and any(of.failed for of in analysed) else 0
+        if (folder / SWEEP).exists():
+            studies = provider("analyse_sweep", f"{folder}, a sweep,")
+            return studies.analyse_sweep(folder, request, more, progress, options)
         check_is_run(folder)
         for of_sweep in (mean_force, free_energy):
             if of_sweep.NAME in names:
@@ -152,7 +137,7 @@ def _analyse(options: Options) -> int:
     print(f"{options.folder}: {text}")
     for note in used["notes"]:
         print(f"  {note}")
-    _print_results(done.results, done.failed, verbose=options.verbose)
+    print_results(done.results, done.failed, verbose=options.verbose)
     print(
         f"\n{len(done.files)} files in {options.folder}, values in {done.files[0].name}. `rigidmd"
         " report` shows them"
@@ -181,11 +166,11 @@ def _insert(path: str, names: list[str], more: dict[str, object], *, verbose: bo
     results, failed = run_analyses(runs, names, options={"zero_loading": True} | more)
     for result in results:  # trials at rest have no time
         result.values = [value._replace(correlation_ps=None) for value in result.values]
-    _print_results(results, failed, verbose=verbose)
+    print_results(results, failed, verbose=verbose)
     return FAILED if failed else 0
 
 
-def _print_results(results: list, failed: dict[str, str], *, verbose: bool) -> None:
+def print_results(results: list, failed: dict[str, str], *, verbose: bool) -> None:
     from rigidmd.features.analysis.report import results_text
 
     print(*results_text(results, failed), sep="\n")
