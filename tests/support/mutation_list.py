@@ -323,8 +323,8 @@ RINGS = [
         "B21",
         "random numbers of every stage are those of the first",
         "assemble/build.py",
-        "    key = key_of(system.scene.seed, THERMOSTAT, k)",
-        "    key = key_of(system.scene.seed, THERMOSTAT, 0)",
+        "    key = noise.key_of(system.scene.seed, noise.THERMOSTAT, k)",
+        "    key = noise.key_of(system.scene.seed, noise.THERMOSTAT, 0)",
         ("assemble/test_build.py::test_stages_have_random_numbers_of_their_own",),
     ),
     Mutation(
