@@ -89,7 +89,7 @@ class Feature:
         return parts
 
     def potentials(self, scene: object) -> dict[str, Callable]:
-        """Pair potentials by keys of [forces], which replace those of the core: functions
+        """Pair potentials by keys of [forces], which act in place of the core: functions
         `interactions` of the parts of a system."""
         return {}
 
