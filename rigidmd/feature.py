@@ -6,7 +6,7 @@ module `feature`, a subclass of `Feature`: the core calls its methods for scenes
 feature may be absent: its folder is not there, and a scene that needs it ends with one sentence.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
@@ -43,6 +43,8 @@ class Row:
     commands: tuple[str, ...] = ()  # modules of its folder `commands`
     formats: tuple[str, ...] = ()  # modules that register file formats
     analyses: tuple[str, ...] = ()  # modules that register analyses
+    #: Modules with an analysis of all points of a sweep, SWEEP_ANALYSIS
+    sweep_analyses: tuple[str, ...] = ()
     programs: tuple[str, ...] = ()  # folders with a program, see `core.programs`
     thermostats: tuple[str, ...] = ()  # modules with a METHOD, see `scene.ensemble_methods`
     barostats: tuple[str, ...] = ()  # the same
@@ -126,6 +128,18 @@ class Feature:
     def page_parts(self, record: object) -> Iterator[tuple[str, Iterator[str]]]:
         """(title, HTML texts) of parts of the page of a run."""
         return iter(())
+
+    def trust(self, path: str | Path) -> None:
+        """Allow scenes to run a Python file with these contents. Raises SceneError."""
+        raise NotImplementedError
+
+    def unused_files(self, scene: object, paths: Sequence[str]) -> list[str]:
+        """The trusted files that a scene does not run."""
+        raise NotImplementedError
+
+    def check_trusted(self, scene: object, paths: Sequence[str]) -> None:
+        """Raise SceneError for a trusted file that a scene does not run."""
+        raise NotImplementedError
 
     def draw_model(self, path: Path, molecule: object, *, force: bool) -> None:
         """Write a picture of a molecular model."""

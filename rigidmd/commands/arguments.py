@@ -11,6 +11,7 @@ from typing import NamedTuple, TypedDict, TypeVar, Unpack
 
 from rigidmd.commands.streams import progress_bar
 from rigidmd.core.programs import engine_options, runnable
+from rigidmd.features import provider
 
 #: Adds an argument to the parser of a command.
 Argument = Callable[[argparse.ArgumentParser], object]
@@ -175,17 +176,16 @@ def read_scene(options: Options, **more):
     from rigidmd.scene import Scene, parse_override
 
     if options.trust:
-        from rigidmd.features.potentials.user_code.trust import check_trusted, trust
-
+        of_users = provider("trust", "--trust")
         for path in options.trust:
-            trust(path)
+            of_users.trust(path)
     overrides = dict(parse_override(text) for text in options.overrides)
     for option, key in {"engine": "name", **{key: key for key in engine_options()}}.items():
         if (value := getattr(options, option, None)) is not None:
             overrides[f"engine.{key}"] = value
     scene = Scene.read(options.scene, overrides | more)
     if options.trust:
-        check_trusted(scene, options.trust)
+        provider("check_trusted", "--trust").check_trusted(scene, options.trust)
     return scene
 
 

@@ -22,12 +22,12 @@ FEATURES = (
         "interactions of users: formula, table, Python function",
         keys=("forces.custom", "forces.bodies", "from_python"),
         acts=True,
-        provides=("shapes",),
+        provides=("shapes", "trust", "unused_files", "check_trusted"),
     ),
     Row(
         "analysis",
         "analyses of runs",
-        needs=("free_energy", "potentials", "view"),
+        needs=("potentials", "view"),
         commands=("analyse",),
         display="display",
         provides=("page_parts",),
@@ -38,13 +38,14 @@ FEATURES = (
         needs=("analysis", "potentials", "studies"),
         keys=("coupling",),
         acts=True,
+        sweep_analyses=("windows", "lambda_sweep"),
         commands=("virial",),
         analyses=("insertion",),
     ),
     Row(
         "studies",
         "many runs: sweep, accuracy, comparison, stability, normal modes",
-        needs=("analysis", "bodies", "free_energy", "potentials", "view"),
+        needs=("analysis", "bodies", "view"),
         commands=("accuracy", "compare", "modes", "stability", "sweep"),
         display="sweep.notebook",
         provides=("analyse_sweep",),
@@ -70,7 +71,7 @@ FEATURES = (
 
 def modules(kind: str) -> Iterator[tuple[str, str]]:
     """(name, full name) of the modules of installed features that add "commands", "formats",
-    "analyses", "thermostats" or "barostats"."""
+    "analyses", "sweep_analyses", "thermostats" or "barostats"."""
     for row in FEATURES:
         if getattr(row, kind) and row.is_installed:
             folder = f"{row.package}.commands" if kind == "commands" else row.package

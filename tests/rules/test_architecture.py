@@ -137,7 +137,6 @@ def upward(package, found):
 REACHING_UP = (
     "assemble/describe.py",
     "assemble/scenes.py",
-    "commands/arguments.py",
     "commands/check.py",
     "engines/cpu/compiled.py",
     "io/trajectory.py",

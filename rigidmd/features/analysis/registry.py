@@ -7,7 +7,7 @@ from importlib import import_module
 from math import inf
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -244,3 +244,22 @@ def _checked_series(name: str, title: object, values: ArrayLike, count: int) -> 
         frame = np.isfinite(array).argmin() + 1
         raise OutputError(f"the analysis {name}: {title!r} is not a finite number at frame {frame}")
     return array
+
+
+class SweepAnalysis(NamedTuple):
+    """An analysis of all points of a sweep together."""
+
+    name: str
+    about: str
+    over: str  # what the sweep varies
+    title: str  # of its points
+    #: Whether a sweep has it without a request. The argument is its manifest
+    is_default: Callable[[Any], bool]
+    #: Analyses the finished points, and writes files. The arguments are the manifest and the type
+    #: of figures
+    write: Callable[[Any, str], tuple[AnalysisResult, list[Path]]]
+
+
+def sweep_analyses() -> list[SweepAnalysis]:
+    """The analyses of sweeps that features have."""
+    return [import_module(name).SWEEP_ANALYSIS for _, name in modules("sweep_analyses")]

@@ -8,9 +8,17 @@ from rigidmd.core.toml import Json
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError
 from rigidmd.features.analysis.files import write_results
+from rigidmd.features.analysis.registry import SweepAnalysis
 from rigidmd.features.analysis.result import AnalysisResult
 from rigidmd.features.free_energy.coupling import lambda_column
-from rigidmd.features.free_energy.estimate import NAME, OF_ALL, SampledLambda, free_energy_of
+from rigidmd.features.free_energy.estimate import (
+    ABOUT,
+    NAME,
+    OF_ALL,
+    OVER,
+    SampledLambda,
+    free_energy_of,
+)
 from rigidmd.features.free_energy.keys import Coupling
 from rigidmd.features.free_energy.windows import (
     manifest_of,
@@ -121,3 +129,6 @@ def _standard_state(system: System, volume: float) -> str:
         f"{who}, from an ideal gas of the same number density, {density}, so that no volume enters;"
         f" {tail} tail correction"
     )
+
+
+SWEEP_ANALYSIS = SweepAnalysis(NAME, ABOUT, OVER, "all points", is_of_coupling, write_free_energy)

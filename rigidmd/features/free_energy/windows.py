@@ -11,9 +11,16 @@ from rigidmd.engines.samples import distance_column
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError
 from rigidmd.features.analysis.files import write_results
+from rigidmd.features.analysis.registry import SweepAnalysis
 from rigidmd.features.analysis.result import AnalysisResult
 from rigidmd.features.analysis.rigid_frames import production_samples
-from rigidmd.features.free_energy.mean_force import Window, potential_of_mean_force
+from rigidmd.features.free_energy.mean_force import (
+    ABOUT,
+    NAME,
+    OVER,
+    Window,
+    potential_of_mean_force,
+)
 from rigidmd.features.studies.sweep.folder import SEED, Manifest, read_manifest
 from rigidmd.features.studies.sweep.table import Table
 from rigidmd.run.record import Record, read_record
@@ -132,3 +139,6 @@ def _window(folder: Path, k: int) -> tuple[Window, float, Json]:
     samples = record.columns[name][production]
     window = Window(not_none(restraint.distance_A), restraint.stiffness[0], samples)
     return window, float(stage.temperatures[1]), used_samples(record, stage, production)
+
+
+SWEEP_ANALYSIS = SweepAnalysis(NAME, ABOUT, OVER, "all windows", is_of_windows, write_mean_force)

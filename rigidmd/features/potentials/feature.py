@@ -1,15 +1,18 @@
 """What [[forces.custom]], [[forces.bodies]] and code of users add to a system. Their modules are
 loaded where they are needed: a stored run needs few of them."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
+from pathlib import Path
 
 from rigidmd.core.state import State
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 from rigidmd.feature import Feature
 from rigidmd.features.potentials.extra import UserExtra, body_pairs_of, with_extra
+from rigidmd.features.potentials.user_code import trust
 from rigidmd.forces.parts import SystemParts
+from rigidmd.scene import Scene
 from rigidmd.scene.molecules import missing_user_code
 
 
@@ -31,6 +34,15 @@ class Potentials(Feature):
         from rigidmd.features.potentials.user_code.binding import user_errors_explained
 
         return user_errors_explained(system)
+
+    def trust(self, path: str | Path) -> None:
+        trust.trust(path)
+
+    def unused_files(self, scene: Scene, paths: Sequence[str]) -> list[str]:
+        return trust.unused_files(scene, paths)
+
+    def check_trusted(self, scene: Scene, paths: Sequence[str]) -> None:
+        trust.check_trusted(scene, paths)
 
     def check_start(self, system: System, state: State) -> list[str]:
         from rigidmd.features.potentials.user_code.compiled import check_compiled_code

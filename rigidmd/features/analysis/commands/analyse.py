@@ -12,14 +12,17 @@ FRAMES = 100  # equal ones, for insertion without a run
 
 class _List(argparse.Action):
     def __call__(self, parser, *_):
-        from rigidmd.features.analysis.registry import analysis_order, known, selected
-        from rigidmd.features.free_energy import estimate as free_energy
-        from rigidmd.features.free_energy import mean_force
+        from rigidmd.features.analysis.registry import (
+            analysis_order,
+            known,
+            selected,
+            sweep_analyses,
+        )
 
         for entry in selected(sorted(known(), key=analysis_order)):
             print(f"{entry.name:18} {entry.about}")
-        for of_sweep in (mean_force, free_energy):
-            print(f"{of_sweep.NAME:18} {of_sweep.ABOUT}, of a sweep")
+        for of_sweep in sweep_analyses():
+            print(f"{of_sweep.name:18} {of_sweep.about}, of a sweep")
         parser.exit()
 
 
@@ -101,10 +104,8 @@ def _analyse(options: Options) -> int:
     from rigidmd.errors import OutputError
     from rigidmd.features import provider
     from rigidmd.features.analysis.files import analyse_folder
-    from rigidmd.features.analysis.registry import run_user_file
+    from rigidmd.features.analysis.registry import run_user_file, sweep_analyses
     from rigidmd.features.analysis.report import frames_text
-    from rigidmd.features.free_energy import estimate as free_energy
-    from rigidmd.features.free_energy import mean_force
     from rigidmd.io.folder import SWEEP, check_is_run
     from rigidmd.scene import parse_override
 
@@ -121,10 +122,10 @@ def _analyse(options: Options) -> int:
             studies = provider("analyse_sweep", f"{folder}, a sweep,")
             return studies.analyse_sweep(folder, request, more, progress, options)
         check_is_run(folder)
-        for of_sweep in (mean_force, free_energy):
-            if of_sweep.NAME in names:
+        for of_sweep in sweep_analyses():
+            if of_sweep.name in names:
                 raise OutputError(
-                    f"{of_sweep.NAME} needs a sweep over {of_sweep.OVER}, and {folder} is the"
+                    f"{of_sweep.name} needs a sweep over {of_sweep.over}, and {folder} is the"
                     " folder of a run"
                 )
         if options.extrapolate is not None:

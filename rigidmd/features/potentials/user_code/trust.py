@@ -1,7 +1,7 @@
 """Python files with user code, which run only if the user trusts them: forces of a scene, and
 analyses."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
@@ -26,7 +26,7 @@ def trust(path: str | Path) -> None:
     _TRUSTED.add(digest_of(_source(Path(path), option("trust"))))
 
 
-def check_trusted(scene: Scene, paths: Iterable[str | Path]) -> None:
+def check_trusted(scene: Scene, paths: Sequence[str]) -> None:
     """Raise SceneError for a trusted file that the scene does not run."""
     for path in unused_files(scene, paths):
         named = ", ".join(map(str, _modules(scene)))
@@ -38,7 +38,7 @@ def check_trusted(scene: Scene, paths: Iterable[str | Path]) -> None:
         raise SceneError(option("trust"), [f"{path} {what}: {files}"])
 
 
-def unused_files(scene: Scene, paths: Iterable[str | Path]) -> list[str | Path]:
+def unused_files(scene: Scene, paths: Sequence[str]) -> list[str]:
     """The trusted files that a scene does not run."""
     contents = [_source(path, "forces") for path in _modules(scene)]
     return [path for path in paths if _source(Path(path), option("trust")) not in contents]

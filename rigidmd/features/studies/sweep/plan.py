@@ -27,7 +27,7 @@ from rigidmd.core.toml import (
     shorten_repr,
 )
 from rigidmd.errors import InputError, OutputError, RigidMDError, SceneError, option
-from rigidmd.features.potentials.user_code.trust import check_trusted, unused_files
+from rigidmd.features import provider
 from rigidmd.features.studies.sweep.folder import (
     SEED,
     Manifest,
@@ -218,7 +218,8 @@ def read_points(path: Path, axes: Sequence[Axis], trusted: Sequence[str] = ()) -
     for values in all_values:
         try:
             scene = Scene.read(path, manifest.overrides(values))
-            unused = unused_files(scene, unused)
+            if unused:
+                unused = provider("unused_files", "--trust").unused_files(scene, unused)
             if not manifest.points:
                 _describe_scene(manifest, scene, digest)
             sha256 = digest_of(scene, digest)
@@ -238,7 +239,8 @@ def read_points(path: Path, axes: Sequence[Axis], trusted: Sequence[str] = ()) -
         errors.append(message if is_everywhere else f"at {points[0]}{more}: {message}")
     if errors or scene is None:
         raise SceneError(str(path), errors)
-    check_trusted(scene, unused)
+    if unused:
+        provider("check_trusted", "--trust").check_trusted(scene, unused)
     return manifest
 
 

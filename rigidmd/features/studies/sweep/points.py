@@ -24,7 +24,7 @@ from rigidmd.core.files import write_text, writing
 from rigidmd.core.process import BY_SIGNAL, OUT_OF_TIME, python_process
 from rigidmd.core.signals import KILL_SIGNAL, SEPARATE_GROUP, STOP_SIGNAL, stop_process
 from rigidmd.errors import OutputError, RigidMDError, SettingError, describe_error, option
-from rigidmd.features.potentials.user_code.trust import unused_files
+from rigidmd.features import provider
 from rigidmd.features.studies.sweep.folder import Manifest, SweepPoint
 from rigidmd.features.studies.sweep.plan import digest_of
 from rigidmd.io.folder import LOCK
@@ -78,7 +78,8 @@ def trusted_by(sweep: Manifest, point: SweepPoint, trust: Sequence[str]) -> list
     """The trusted files that the scene of a point runs."""
     if not trust:
         return []
-    unused = unused_files(Scene.read(sweep.scene, sweep.overrides(point.values)), trust)
+    scene = Scene.read(sweep.scene, sweep.overrides(point.values))
+    unused = provider("unused_files", "--trust").unused_files(scene, trust)
     return [path for path in trust if path not in unused]
 
 

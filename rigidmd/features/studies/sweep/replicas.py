@@ -10,14 +10,10 @@ from rigidmd.core.files import writing
 from rigidmd.errors import OutputError, RigidMDError
 from rigidmd.features.analysis.files import FIGURES, AnalysisOutput, analyse_frames
 from rigidmd.features.analysis.options import check_options
-from rigidmd.features.analysis.registry import selected
+from rigidmd.features.analysis.registry import selected, sweep_analyses
 from rigidmd.features.analysis.result import AnalysisResult
 from rigidmd.features.analysis.rigid_frames import MOST_NUMBERS, RigidFrames, frames_of_folder
 from rigidmd.features.analysis.runs import Runs, as_runs
-from rigidmd.features.free_energy.estimate import NAME as FREE_ENERGY
-from rigidmd.features.free_energy.lambda_sweep import is_of_coupling, write_free_energy
-from rigidmd.features.free_energy.mean_force import NAME as MEAN_FORCE
-from rigidmd.features.free_energy.windows import is_of_windows, write_mean_force
 from rigidmd.features.studies.sweep.figure import write_analyses_figure
 from rigidmd.features.studies.sweep.folder import (
     Manifest,
@@ -31,11 +27,6 @@ from rigidmd.io.folder import add_to_folder
 from rigidmd.run.record import read_record
 
 ANALYSES = "analysis.csv"
-#: Analysis of all points together -> title, whether a sweep has it by default, and what makes it.
-OF_SWEEPS = {
-    MEAN_FORCE: ("all windows", is_of_windows, write_mean_force),
-    FREE_ENERGY: ("all points", is_of_coupling, write_free_energy),
-}
 
 Progress = Callable[[float, str], object]
 Analyse = Callable[..., AnalysisOutput]
@@ -76,18 +67,20 @@ def analyse_sweep(
             f"{folder}: no point of this sweep has finished yet. `rigidmd sweep` continues it"
         )
     combinations = []
-    others = [name for name in names if name not in OF_SWEEPS]
+    of_sweeps = sweep_analyses()
+    others = [name for name in names if name not in {analysis.name for analysis in of_sweeps}]
     if others or not names:
         check_options([entry.function for entry in selected(others)], options or {})
         analyse = partial(
             analyse_frames, names=others, viscosity=viscosity, figures=figures, options=options
         )
         combinations = _analyse_combinations(manifest, start, analyse, progress)
-    for name, (title, is_default, write) in OF_SWEEPS.items():
-        if name not in names and (names or not is_default(manifest)):
+    for analysis in of_sweeps:
+        name, title = analysis.name, analysis.title
+        if name not in names and (names or not analysis.is_default(manifest)):
             continue
         try:
-            result, files = write(manifest, figures)
+            result, files = analysis.write(manifest, figures)
             combinations.append(Combination(title, len(finished), [result], {}, files))
         except OutputError as error:
             if name in names:

@@ -11,7 +11,7 @@ from rigidmd.core.files import write_text, writing
 from rigidmd.core.plain_text import UNSAFE, as_word, in_comment
 from rigidmd.core.process import OUT_OF_TIME
 from rigidmd.errors import OutputError, SimulationError
-from rigidmd.features.potentials.user_code.trust import trust as trust_file
+from rigidmd.features import provider
 from rigidmd.features.studies.sweep.figure import collect
 from rigidmd.features.studies.sweep.folder import FILES, SCRIPT, Manifest, is_sweep, read_manifest
 from rigidmd.features.studies.sweep.limits import step_key
@@ -85,7 +85,7 @@ def open_sweep(
     Raises SceneError, OutputError.
     """
     for path in trust:
-        trust_file(path)
+        provider("trust", "--trust").trust(path)
     data, _ = read_tables(scene)
     if replicas is not None:
         axes = with_seeds(scene, axes, replicas, data)
