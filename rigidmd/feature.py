@@ -37,6 +37,7 @@ class Row:
     #: Keys of scenes that belong to it, such as "forces.custom", or "stages.thermostat=NAME" for
     #: one value. A scene in which one has a value uses the feature
     keys: tuple[str, ...] = ()
+    file_keys: str = ""  # pattern of its keys that name a file
     acts: bool = False  # whether it changes systems: a scene that uses it cannot do without
     #: Methods of its `Feature` that are called by their name, and not for scenes with its keys
     provides: tuple[str, ...] = ()

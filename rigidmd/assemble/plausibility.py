@@ -142,9 +142,8 @@ def _lengths(forces: "Forces") -> dict[str, float | None]:
         for where, table in tables.items()
         for name in names
     }
-    for k, entry in enumerate(forces.bodies):
-        radius = entry.options.get("reaction_field_A")
-        lengths[f"forces.bodies.{k}.options.reaction_field_A"] = radius
+    for where, force in forces.added.items():
+        lengths |= {f"{where}.{key}": length for key, length in force.more_lengths.items()}
     return lengths
 
 

@@ -25,6 +25,15 @@ from rigidmd.units import GRAM_PER_CM3
 
 
 @runtime_checkable
+class TermMaker(Protocol):
+    """An object that makes a term for a system."""
+
+    def term(self, system: "System") -> NamedTuple:
+        """A NamedTuple of a class with `compiled_force`."""
+        ...
+
+
+@runtime_checkable
 class ThermostatOfStages(Protocol):
     """A user-defined thermostat that is made for each stage."""
 

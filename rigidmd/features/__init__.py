@@ -1,6 +1,7 @@
 """The list of features, in names and words: importing it loads none of them."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from operator import attrgetter
 
 from rigidmd.feature import Feature, Row
 
@@ -21,6 +22,7 @@ FEATURES = (
         "potentials",
         "interactions of users: formula, table, Python function",
         keys=("forces.custom", "forces.bodies", "from_python"),
+        file_keys=r"forces\.(custom|bodies)\.[^.]+\.(module|table)",
         acts=True,
         provides=("shapes", "trust", "unused_files", "check_trusted"),
     ),
@@ -88,7 +90,17 @@ def used_by(scene: object) -> Iterator[Row]:
 def acting_on(scene: object) -> list[Feature]:
     """The features that a scene uses and that change its system. Raises MissingFeatureError."""
     rows = (row for row in used_by(scene) if row.acts)
-    return [row.load(f"the scene, which has {' or '.join(row.keys)},") for row in rows]
+    return [row.load(f"a scene with {' or '.join(row.keys)}") for row in rows]
+
+
+def check_installed(tables: Mapping, source: str) -> None:
+    """Raise MissingFeatureError if a scene with these tables needs a feature that is absent."""
+    rows = {row.name: row for row in FEATURES}
+    for row in filter(attrgetter("acts"), FEATURES):
+        absent = [name for name in (row.name, *row.needs) if not rows[name].is_installed]
+        keys = [key for key in row.keys if absent and _has(tables, *key.partition("=")[::2])]
+        if keys:
+            raise rows[absent[0]].missing(f"{source}: {keys[0]}")
 
 
 def _has(value: object, path: str, wanted: str) -> bool:
@@ -97,7 +109,8 @@ def _has(value: object, path: str, wanted: str) -> bool:
         return any(_has(entry, path, wanted) for entry in value)
     if path:
         first, _, rest = path.partition(".")
-        return _has(getattr(value, first, None), rest, wanted)
+        inner = value.get(first) if isinstance(value, Mapping) else getattr(value, first, None)
+        return _has(inner, rest, wanted)
     return str(value) == wanted if wanted else bool(value)
 
 

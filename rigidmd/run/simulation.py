@@ -50,16 +50,15 @@ if TYPE_CHECKING:
 
     from rigidmd.engines.observables import Observation
     from rigidmd.engines.protocol import Engine
-    from rigidmd.engines.system import System
+    from rigidmd.engines.system import System, TermMaker, ThermostatOfStages
     from rigidmd.features.bodies.run import BodyRun
     from rigidmd.features.bodies.system import BodySystem, Pose
-    from rigidmd.features.potentials.user_code.force import Force, HasStage, HasTerm
-    from rigidmd.features.potentials.user_code.pair_potential import PairPotential
     from rigidmd.run.minimise import OverlapRemoval
     from rigidmd.run.molecular import MolecularRun
     from rigidmd.scene import MolecularScene
+    from rigidmd.scene.molecules import UserForce
 
-    UserForce = Force | PairPotential | HasTerm | NamedTuple
+    AnyForce = UserForce | TermMaker | NamedTuple
 
     class Options(TypedDict, total=False):
         """The keyword arguments of `Simulation`, which are described there."""
@@ -69,8 +68,8 @@ if TYPE_CHECKING:
         warn: Callable[[str], object]
         resume: bool
         walltime: float | None
-        forces: UserForce | Sequence[UserForce] | None
-        thermostat: NamedTuple | HasStage | None
+        forces: AnyForce | Sequence[AnyForce] | None
+        thermostat: NamedTuple | ThermostatOfStages | None
         applied: Mapping[str, Callable[[Pose], tuple]] | None
 
 
@@ -195,8 +194,8 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         warn: Callable[[str], object] = _as_warning,
         resume: bool = False,
         walltime: float | None = None,
-        forces: "UserForce | Sequence[UserForce] | None" = None,
-        thermostat: "NamedTuple | HasStage | None" = None,
+        forces: "AnyForce | Sequence[AnyForce] | None" = None,
+        thermostat: "NamedTuple | ThermostatOfStages | None" = None,
         applied: "Mapping[str, Callable[[Pose], tuple]] | None" = None,
     ):
         scene = _as_scene(scene)

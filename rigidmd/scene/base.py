@@ -36,6 +36,7 @@ from rigidmd.core.toml import (
     values_in,
 )
 from rigidmd.errors import SceneError, option
+from rigidmd.features import FEATURES, check_installed
 from rigidmd.formats import Format, format_of, written
 from rigidmd.scene.integrators import IntegratorRow, with_registered_rows
 from rigidmd.scene.validation import (
@@ -62,7 +63,12 @@ LONGEST_NAME = 100
 LONGEST_FILE_NAME = 200
 #: Keys that name a file.
 FILE_KEYS = re.compile(
-    r"(structure|(molecules|forces\.(custom|bodies))\.[^.]+)\.(file|topology|parameters|module|table)"
+    "|".join(
+        [
+            r"(structure|molecules\.[^.]+)\.(file|topology|parameters)",
+            *(row.file_keys for row in FEATURES if row.file_keys),
+        ]
+    )
 )
 #: Programs whose input files have these names.
 FOREIGN_INPUTS = {
@@ -255,6 +261,7 @@ class Scene(Section, Displayed):
                 text = ""  # the entries after a removed one are numbered differently in the text
             else:
                 overridden.append(key)
+        check_installed(data, source)
         if wrong := impossible_values(data):
             raise SceneError(
                 source, [f"{location_of(keys, text, overridden)}: {fault}" for keys, fault in wrong]

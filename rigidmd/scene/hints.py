@@ -8,6 +8,7 @@ from pathlib import Path
 from pydantic import BaseModel
 
 from rigidmd.core.plain_text import did_you_mean, plain_letters, suggestion
+from rigidmd.features import FEATURES
 
 FOREIGN_KEYS = Path(__file__).with_name("foreign_keys.toml")
 #: Names that readers give to tables -> the table of a scene.
@@ -20,8 +21,9 @@ TABLES = {
 }
 #: Keys of the top level that only a scene of molecules has, and only one of a single body.
 OF_MOLECULES = (
-    *("box", "coupling", "engine", "fields", "forces", "from_python"),
-    *("molecules", "precision", "seed", "stages", "structure", "threads"),
+    *("box", "engine", "fields", "forces", "from_python", "molecules", "precision", "seed"),
+    *("stages", "structure", "threads"),
+    *(row.keys[0] for row in FEATURES if row.acts and "." not in row.keys[0]),
 )
 OF_A_BODY = (
     *("applied", "body", "changing_inertia", "fluid"),

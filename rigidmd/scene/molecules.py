@@ -3,21 +3,21 @@
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, NamedTuple, TypedDict
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 from pydantic import Field, PrivateAttr, Strict
 
 from rigidmd.core.plain_text import distinct
 from rigidmd.core.toml import Json
 from rigidmd.errors import SceneError, option
-from rigidmd.features.free_energy.keys import Coupling
 from rigidmd.formats import BY_EXTENSION, TOPOLOGIES, TOPOLOGY, TRAJECTORY, format_of, written
 from rigidmd.scene.base import Scene, file_name, is_inside
 from rigidmd.scene.engine import EngineChoice
 from rigidmd.scene.ensemble_methods import default_interval
 from rigidmd.scene.fields import Fields, field_errors
-from rigidmd.scene.forces import FORCE_FILES, Forces
+from rigidmd.scene.forces import Forces
 from rigidmd.scene.models import SIZES
+from rigidmd.scene.of_features import CouplingKeys, CouplingSettings
 from rigidmd.scene.species import SPECIES_FILES, Box, Molecules, Start, Structure
 from rigidmd.scene.stage import Stage
 from rigidmd.scene.validation import (
@@ -33,8 +33,12 @@ from rigidmd.scene.validation import (
 )
 
 
+class UserForce:
+    """A force of Python for a scene, see `MolecularScene.with_user_code`."""
+
+
 class UserCode(NamedTuple):
-    """Forces and a thermostat, from which `rigidmd.features.potentials.user_code` makes terms."""
+    """Forces and a thermostat, of which a feature makes terms."""
 
     forces: tuple[object, ...] = ()
     thermostat: object = None
@@ -152,7 +156,7 @@ class Watch(Section):
     longer"""
 
 
-class Settings(TypedDict, total=False):
+class Settings(CouplingSettings, total=False):
     """Keywords of `scene_from_atoms`: the tables and keys of a scene file except [[molecules]]."""
 
     name: str
@@ -164,7 +168,6 @@ class Settings(TypedDict, total=False):
     box: Json
     forces: Json
     fields: Json
-    coupling: Json
     start: Json
     integrators: list[Json]
     stages: list[Json]
@@ -173,10 +176,8 @@ class Settings(TypedDict, total=False):
     watch: Json
 
 
-class MolecularScene(Scene):
-    """A scene of moving molecules."""
-
-    SIZES: ClassVar[tuple[float, float]] = SIZES
+class MatterKeys(Scene):
+    """The keys of what there is and what acts on it."""
 
     seed: Annotated[int, Strict(), Field(ge=0)] = 1
     """Seed of all random numbers"""
@@ -192,7 +193,13 @@ class MolecularScene(Scene):
     molecules: tuple[Molecules, ...] = Field(min_length=1, max_length=MOST_TABLES)
     forces: Forces = Forces.model_construct()
     fields: Fields = Fields.model_construct()
-    coupling: Coupling | None = None
+
+
+class MolecularScene(CouplingKeys, MatterKeys):
+    """A scene of moving molecules."""
+
+    SIZES: ClassVar[tuple[float, float]] = SIZES
+
     start: Start = Start.model_construct()
     stages: tuple[Stage, ...] = Field(min_length=1, max_length=MOST_TABLES)
     run: RunSettings = RunSettings.model_construct()
@@ -282,7 +289,7 @@ class MolecularScene(Scene):
         for k, species in enumerate(self.molecules):
             names |= {f"molecules.{k}.{key}": getattr(species, key) for key in SPECIES_FILES}
         for where, force in self.forces.added.items():
-            names |= {f"{where}.{key}": getattr(force, key, None) for key in FORCE_FILES}
+            names |= {f"{where}.{key}": file for key, file in force.files.items()}
         return {key: self.path(name) for key, name in names.items() if name is not None}
 
     @property

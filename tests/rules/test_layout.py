@@ -67,7 +67,8 @@ TESTED_BY = {
     "features/potentials/test_torques.py": "features/potentials/user_code/pose_checks",
     "features/potentials/test_user_code.py": "features/potentials/user_code/binding"
     " features/potentials/user_code/compiled features/potentials/user_code/trust core/user_modules"
-    " features/potentials/user_code/kernels features/potentials/extra",
+    " features/potentials/user_code/kernels features/potentials/extra features/potentials/feature"
+    " features/potentials/keys scene/added_forces",
     "features/studies/accuracy/test_averages.py": "features/studies/accuracy/averages_report",
     "features/studies/sweep/test_sweeping.py": "features/studies/commands/compare features/studies/commands/sweep features/studies/compare"
     " features/studies/sweep/folder"

@@ -1,9 +1,10 @@
 """The table [coupling]: a species whose interactions are scaled, for free energies."""
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypedDict
 
 from pydantic import Field, Strict, create_model
 
+from rigidmd.core.toml import Json
 from rigidmd.scene.validation import MOST_TABLES, Section, ShortName
 
 Fraction = Annotated[float, Strict(), Field(ge=0, le=1)]
@@ -52,3 +53,15 @@ class Coupling(_WithLambda):
 
     def at(self, value: float) -> "Coupling":
         return self.model_copy(update={"lambda": value})
+
+
+class CouplingKeys(Section):
+    """The table [coupling] of a scene."""
+
+    coupling: Coupling | None = None
+
+
+class CouplingSettings(TypedDict, total=False):
+    """The keyword of `scene_from_atoms`."""
+
+    coupling: Json

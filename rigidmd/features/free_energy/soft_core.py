@@ -21,7 +21,7 @@ from rigidmd.forces.neighbors.sites import exclusion_groups
 from rigidmd.forces.parts import InnerPairs, Interactions, SystemParts, Tail, sum_of_tails
 from rigidmd.forces.potentials import lennard_jones
 from rigidmd.forces.potentials.truncation import Truncation, truncation_terms
-from rigidmd.scene.forces import TruncationName
+from rigidmd.scene.truncation import TruncationName
 from rigidmd.scene.validation import not_none
 
 SOFTNESS = 0.5  # at lambda = 0, the alpha of the paper

@@ -27,7 +27,8 @@ from rigidmd.forces.potentials.truncation import (
     truncation_of,
     truncation_terms,
 )
-from rigidmd.scene.forces import Forces, TruncationName
+from rigidmd.scene.forces import Forces
+from rigidmd.scene.truncation import TruncationName
 from rigidmd.units import COULOMB_CHARGE
 
 

@@ -43,8 +43,8 @@ from rigidmd.forces.potentials.truncation import (
     truncation_of,
     truncation_terms,
 )
-from rigidmd.scene.forces import TruncationName
 from rigidmd.scene.models import Mixing
+from rigidmd.scene.truncation import TruncationName
 from rigidmd.units import KJ_PER_MOL
 
 

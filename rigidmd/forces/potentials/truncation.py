@@ -22,7 +22,7 @@ from numpy.polynomial import chebyshev
 
 from rigidmd.compile import chosen_by_type, is_a, kernel
 from rigidmd.compile.simd import inverse_square_root, polynomial
-from rigidmd.scene.forces import TruncationName
+from rigidmd.scene.truncation import TruncationName
 
 TRUNCATIONS: tuple[str, ...] = get_args(TruncationName)
 

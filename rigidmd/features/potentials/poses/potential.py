@@ -4,6 +4,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+from rigidmd.scene.molecules import UserForce
+
 if TYPE_CHECKING:
     from rigidmd.features.potentials.poses.table import BodyTable
 
@@ -12,7 +14,7 @@ Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class BodyPairPotential:
+class BodyPairPotential(UserForce):
     """A potential of pairs of bodies for `Simulation(scene, forces=[...])`, made by
     `body_pair_potential`."""
 

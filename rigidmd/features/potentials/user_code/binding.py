@@ -14,9 +14,10 @@ from rigidmd.dynamics.model import count_degrees_of_freedom
 from rigidmd.engines.cpu.compiled import LOAD
 from rigidmd.engines.cpu.engine import BOX, EXTENSION, CompileError
 from rigidmd.engines.samples import IN_LOGS
-from rigidmd.engines.system import System, ThermostatOfStages
+from rigidmd.engines.system import System, TermMaker, ThermostatOfStages
 from rigidmd.errors import SceneError, describe_error
 from rigidmd.features.potentials.extra import UserExtra, with_extra
+from rigidmd.features.potentials.keys import BodyForce, CustomForce
 from rigidmd.features.potentials.user_code.body_pairs import (
     BodyPairPotential,
     bind_body_pairs,
@@ -27,7 +28,6 @@ from rigidmd.features.potentials.user_code.cutoffs import check_cutoff
 from rigidmd.features.potentials.user_code.force import (
     BoundTerm,
     Force,
-    HasTerm,
     UserForceError,
     bind_force,
     changes_momentum,
@@ -39,7 +39,6 @@ from rigidmd.features.potentials.user_code.trust import trusted_module
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.parts import sum_of_tails
 from rigidmd.scene import MolecularScene
-from rigidmd.scene.forces import BodyForce, CustomForce
 from rigidmd.scene.molecules import name_of
 from rigidmd.scene.validation import not_none
 
@@ -211,7 +210,7 @@ def bind(force: object, system: System, name: str) -> BoundTerm:
 
 def _bind_term(made: object, system: System) -> BoundTerm:
     """A finished term, or an object whose method `term` makes it for a system."""
-    if isinstance(made, HasTerm):
+    if isinstance(made, TermMaker):
         try:
             made = made.term(system)
         except (ValueError, SceneError):

@@ -13,6 +13,7 @@ import numpy as np
 from rigidmd.core.plain_text import did_you_mean
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
+from rigidmd.features.potentials.keys import BodyForce
 from rigidmd.features.potentials.poses.bodies import reference_of
 from rigidmd.features.potentials.poses.potential import BodyPairPotential, Parameters, Vector
 from rigidmd.features.potentials.tables import reach_errors
@@ -27,7 +28,6 @@ from rigidmd.features.potentials.user_code.cutoffs import (
 )
 from rigidmd.features.potentials.user_code.force import BoundTerm
 from rigidmd.scene import MolecularScene
-from rigidmd.scene.forces import BodyForce
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.validation import not_none
 from rigidmd.units import KJ_PER_MOL

@@ -11,7 +11,7 @@ from rigidmd.engines.system import System
 from rigidmd.features.potentials.sites.formulas import FormulaError
 from rigidmd.forces.potentials.truncation import MINIMUM_TOLERANCE
 from rigidmd.formats.cells import pairs_within
-from rigidmd.scene.forces import TruncationName
+from rigidmd.scene.truncation import TruncationName
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 #: Largest energy at the cutoff without a warning, in kT, see `ValuesAtCutoff.lost`. Lennard-Jones

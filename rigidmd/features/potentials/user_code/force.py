@@ -3,7 +3,7 @@
 import time as clock
 import traceback
 from collections.abc import Callable, Sequence
-from typing import ClassVar, NamedTuple, Protocol, SupportsFloat, cast, runtime_checkable
+from typing import ClassVar, NamedTuple, SupportsFloat, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,26 +14,10 @@ from rigidmd.errors import SimulationError, describe_error
 from rigidmd.features.potentials.poses.potential import BodyPairPotential
 from rigidmd.features.potentials.python_forces import PythonForces, PythonForcesWorkspace
 from rigidmd.forces.parts import Tail
+from rigidmd.scene.molecules import UserForce
 from rigidmd.units import KJ_PER_MOL
 
 EVERY = (True, True, True)
-
-
-@runtime_checkable
-class HasTerm(Protocol):
-    """An object that makes a compiled term for a system."""
-
-    def term(self, system: System) -> NamedTuple:
-        """A NamedTuple of a class with `compiled_force`."""
-        ...
-
-
-class HasStage(Protocol):
-    """An object that makes a compiled thermostat for each stage."""
-
-    def for_stage(self, system: System, k: int) -> NamedTuple:
-        """The thermostat of stage k, a NamedTuple of a class with `compiled_thermostat`."""
-        ...
 
 
 class BoundTerm(NamedTuple):
@@ -58,7 +42,7 @@ class NotFiniteError(UserForceError):
     """A force of user code has values that are not finite."""
 
 
-class Force:
+class Force(UserForce):
     """A force on molecules in plain Python: derive a class from it and define `on_sites` or
     `on_molecules`.
 

@@ -18,7 +18,8 @@ from rigidmd.features.potentials.sites.formulas import (
 from rigidmd.features.potentials.user_code.cutoffs import PairPotentialError
 from rigidmd.features.potentials.user_code.tables import Columns, read_columns
 from rigidmd.forces.potentials.truncation import TRUNCATIONS
-from rigidmd.scene.forces import TruncationName
+from rigidmd.scene.molecules import UserForce
+from rigidmd.scene.truncation import TruncationName
 from rigidmd.scene.validation import did_you_mean, not_none
 
 Rule = Literal["geometric", "arithmetic", "harmonic"]
@@ -29,7 +30,7 @@ DEFAULT_NAME = "pair_potential"
 
 
 @dataclass(frozen=True)
-class PairPotential:
+class PairPotential(UserForce):
     """A pair potential for `Simulation(scene, forces=[...])`, made by `pair_potential`."""
 
     energy: "str | Callable | None"

@@ -44,8 +44,8 @@ from rigidmd.forces.potentials.truncation import (
     truncation_of,
     truncation_terms,
 )
-from rigidmd.scene.forces import TruncationName
 from rigidmd.scene.models import Molecule
+from rigidmd.scene.truncation import TruncationName
 from rigidmd.scene.validation import did_you_mean
 
 #: Largest error of the spline of a table without a warning, relative to its deepest energy.
