@@ -92,8 +92,8 @@ class Feature:
         return parts
 
     def potentials(self, scene: object) -> dict[str, Callable]:
-        """Pair potentials by keys of [forces], which act in place of the core: functions
-        `interactions` of the parts of a system."""
+        """Pair potentials in place of the core's, by keys of [forces]: functions `interactions` of
+        the parts of a system."""
         return {}
 
     def extend(self, system: System, parts: object, *, user_code: bool) -> System:
@@ -113,7 +113,16 @@ class Feature:
         return nullcontext()
 
     def check_start(self, system: object, state: object) -> list[str]:
-        """Notes on the system at the start of a run. Raises SceneError."""
+        """Notes on the system at the start of a run, before anything is compiled. Raises
+        SceneError."""
+        return []
+
+    def check_forces(self, system: object, state: object) -> None:
+        """Check the forces of the feature at the start of a run, where no molecules overlap. Raises
+        SceneError."""
+
+    def notes_on_start(self, system: object, state: object) -> list[str]:
+        """Notes on the start of a run, after everything is compiled."""
         return []
 
     def warning_at(self, system: object, state: object) -> str:

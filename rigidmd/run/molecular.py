@@ -32,7 +32,7 @@ from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.progress import progress_of
 from rigidmd.io.scene_file import input_names
 from rigidmd.run import checks
-from rigidmd.run.force_errors import check_forces, coulomb_errors, velocity_notes
+from rigidmd.run.force_errors import coulomb_errors
 from rigidmd.run.mean_box import scale_to_mean_box
 from rigidmd.run.minimise import (
     Enthalpy,
@@ -179,9 +179,11 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
                         method = self._integrator(k)
                         self.engine.advance(self._state_for(method), method, 0.0, 0)
         self.engine.forget()
-        sentences = [*velocity_notes(self.system, self.state), *accuracy_warnings(self.scene)]
-        for sentence in sentences:
-            self.simulation._note(sentence)
+        for feature in acting_on(self.scene):
+            for note in feature.notes_on_start(self.system, self.state):
+                self.simulation._note(note)
+        for warning in accuracy_warnings(self.scene):
+            self.simulation._note(warning)
 
     @contextmanager
     def _explained(self) -> Iterator[None]:
@@ -216,7 +218,8 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             )
             if removal.excess > 1:
                 raise SceneError(scene.source, [self._why_too_strong(removal, thermal, dt)])
-        check_forces(system, self.state)
+        for feature in acting_on(scene):
+            feature.check_forces(system, self.state)
         self.engine.forget()
 
     def _why_too_strong(self, removal: OverlapRemoval, thermal: float, dt: float) -> str:

@@ -60,7 +60,7 @@ TESTED_BY = {
     "features/potentials/test_custom.py": "features/potentials/user_code/pair_potential"
     " features/potentials/user_code/pair_terms features/potentials/user_code/cutoffs features/potentials/sites/formulas",
     "features/potentials/test_pose_tables.py": "features/potentials/poses/pairs",
-    "features/potentials/test_python_forces.py": "features/potentials/user_code/force",
+    "features/potentials/test_python_forces.py": "features/potentials/user_code/force features/potentials/user_code/force_checks",
     "features/potentials/test_shipped.py": "features/potentials/poses/shapes features/potentials/poses/bodies features/potentials/poses/formulas features/potentials/poses/gay_berne"
     " features/potentials/poses/multipoles features/potentials/poses/patch features/potentials/poses/potential",
     "features/potentials/test_slopes.py": "features/potentials/poses/trace",

@@ -49,6 +49,16 @@ class Potentials(Feature):
 
         return check_compiled_code(system, state)
 
+    def check_forces(self, system: System, state: State) -> None:
+        from rigidmd.features.potentials.user_code.force_checks import check_forces
+
+        check_forces(system, state)
+
+    def notes_on_start(self, system: System, state: State) -> list[str]:
+        from rigidmd.features.potentials.user_code.force_checks import velocity_notes
+
+        return velocity_notes(system, state)
+
     def warning_at(self, system: System, state: State) -> str:
         if not body_pairs_of(system):
             return ""

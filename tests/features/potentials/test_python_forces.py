@@ -14,7 +14,7 @@ import rigidmd
 from rigidmd.assemble.build import build
 from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError, SimulationError
-from rigidmd.run.force_errors import check_forces
+from rigidmd.features.potentials.user_code.force_checks import check_forces
 
 # --- forces in Python -----------------------------------------------------------------------------
 
