@@ -21,7 +21,7 @@ FEATURES = (
     Row(
         "potentials",
         "interactions of users: formula, table, Python function",
-        keys=("forces.custom", "forces.bodies", "from_python"),
+        keys=("forces.custom", "forces.bodies", "forces.added", "from_python"),
         file_keys=r"forces\.(custom|bodies)\.[^.]+\.(module|table)",
         acts=True,
         provides=("shapes", "trust", "unused_files", "check_trusted"),

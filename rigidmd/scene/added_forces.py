@@ -8,8 +8,8 @@ class AddedForce(Section):
 
     @property
     def label(self) -> str:
-        """Its name in the log."""
-        raise NotImplementedError
+        """Its name in the log. Default: that of its file."""
+        return type(self).__module__.rpartition(".")[2]
 
     @property
     def files(self) -> dict[str, str | None]:

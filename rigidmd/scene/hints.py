@@ -9,6 +9,7 @@ from pydantic import BaseModel
 
 from rigidmd.core.plain_text import did_you_mean, plain_letters, suggestion
 from rigidmd.features import FEATURES
+from rigidmd.scene.table_in_file import TableInFile
 
 FOREIGN_KEYS = Path(__file__).with_name("foreign_keys.toml")
 #: Names that readers give to tables -> the table of a scene.
@@ -180,7 +181,7 @@ def known_keys(model: type[BaseModel], keys: list) -> list[str]:
     for key in keys:
         if isinstance(key, int):
             continue
-        inner = models_in(model.model_fields[key].annotation)
+        inner = models_in(model.model_fields[key].rebuild_annotation())
         if not inner:
             return []
         model = inner[0]
@@ -191,7 +192,10 @@ def models_in(annotation: object) -> list[type[BaseModel]]:
     """The models in the type of a key."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
-    return [model for part in getattr(annotation, "__args__", ()) for model in models_in(part)]
+    if isinstance(annotation, TableInFile):
+        return [annotation.model]
+    parts = (*getattr(annotation, "__args__", ()), *getattr(annotation, "__metadata__", ()))
+    return [model for part in parts for model in models_in(part)]
 
 
 def in_british(name: str) -> str:

@@ -68,7 +68,7 @@ TESTED_BY = {
     "features/potentials/test_user_code.py": "features/potentials/user_code/binding"
     " features/potentials/user_code/compiled features/potentials/user_code/trust core/user_modules"
     " features/potentials/user_code/kernels features/potentials/extra features/potentials/feature"
-    " features/potentials/keys scene/added_forces",
+    " features/potentials/keys scene/added_forces scene/table_in_file",
     "features/studies/accuracy/test_averages.py": "features/studies/accuracy/averages_report",
     "features/studies/sweep/test_sweeping.py": "features/studies/commands/compare features/studies/commands/sweep features/studies/compare"
     " features/studies/sweep/folder"
@@ -84,7 +84,7 @@ TESTED_BY = {
     "forces/ewald/test_direct_sum.py": "forces/ewald/smooth",
     "forces/neighbors/test_clusters.py": "forces/neighbors/tree",
     "forces/neighbors/test_pair_loop.py": "forces/neighbors/rows forces/neighbors/sites",
-    "forces/potentials/test_potentials.py": "forces/potentials/lennard_jones",
+    "forces/potentials/test_truncation.py": "forces/potentials/lennard_jones",
     "forces/test_terms.py": "forces/neighbors/space forces/parts",
     "formats/test_atoms.py": "features/crystals/g96",
     "io/test_progress.py": "io/run_files",

@@ -324,7 +324,7 @@ TIERS = {
         "forces/neighbors/test_update.py": (
             "a_list_with_almost_no_skin_is_built_at_every_step[mixed*",
         ),
-        "forces/potentials/test_potentials.py": ("adding_a_pair_potential_takes_two_files",),
+        "features/potentials/test_pairs.py": ("adding_a_pair_potential_takes_one_file",),
         "features/crystals/test_framework.py": ("a_published_henry_constant",),
         "end_to_end/test_fuzz.py": ("all_that_is_changed_is_valid*",),
         "features/studies/test_joint_fit.py": ("pulls_of_joint_limits_have_unit_width*",),

@@ -1,11 +1,13 @@
 """The keys of [forces] for potentials of users: of sites and of pairs of bodies."""
 
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, create_model
 
 from rigidmd.core.toml import Json, shorten_repr
 from rigidmd.scene.added_forces import AddedForce, AddedForces
+from rigidmd.scene.table_in_file import TableInFile
 from rigidmd.scene.truncation import TruncationName
 from rigidmd.scene.validation import MOST_TABLES, Cutoff, Line, Number, Positive, Section
 
@@ -172,8 +174,20 @@ class BodyForce(AddedForce):
         return {"options.reaction_field_A": self.options.get("reaction_field_A")}
 
 
-class PotentialKeys(AddedForces):
-    """The keys of custom forces and of pair potentials of bodies."""
+#: Names of the pair potentials in `pairs`, each of which is a key.
+PAIRS = sorted(file.stem for file in Path(__file__).with_name("pairs").glob("[a-z]*.py"))
+_of_pairs = {
+    name: (Annotated[object, TableInFile(f"rigidmd.features.potentials.pairs.{name}")], None)
+    for name in PAIRS
+}
+if TYPE_CHECKING:
+    _PairKeys = AddedForces
+else:  # as many keys as there are files
+    _PairKeys = create_model("_PairKeys", __base__=AddedForces, __module__=__name__, **_of_pairs)
+
+
+class PotentialKeys(_PairKeys):
+    """The keys of custom forces, of pair potentials of bodies and of those with a key each."""
 
     custom: tuple[CustomForce, ...] = Field(default=(), max_length=MOST_TABLES)
     """Custom forces"""
@@ -182,13 +196,14 @@ class PotentialKeys(AddedForces):
 
     @property
     def added(self) -> dict[str, AddedForce]:
-        """The tables of custom forces and pair potentials of bodies, by their keys."""
+        """The tables of all these, by their keys."""
         tables = {"custom": self.custom, "bodies": self.bodies}
-        return {
+        lists = {
             f"forces.{key}.{k}": entry
             for key, entries in tables.items()
             for k, entry in enumerate(entries)
         }
+        return lists | {f"forces.{name}": force for name in PAIRS if (force := getattr(self, name))}
 
     @property
     def added_not_summable(self) -> tuple[tuple[str, object], ...]:
@@ -196,4 +211,4 @@ class PotentialKeys(AddedForces):
             "custom forces have no such sum, so that a part of the dispersion would end at the"
             " cutoff"
         )
-        return ((why, self.custom),)
+        return ((why, len(self.added) > len(self.bodies)),)

@@ -39,6 +39,7 @@ from rigidmd.features.potentials.user_code.trust import trusted_module
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.parts import sum_of_tails
 from rigidmd.scene import MolecularScene
+from rigidmd.scene.added_forces import AddedForce
 from rigidmd.scene.molecules import name_of
 from rigidmd.scene.validation import not_none
 
@@ -59,7 +60,7 @@ def custom_forces(scene: MolecularScene) -> list[object]:
         try:
             forces.append(_custom(scene, entry, where))
         except (SceneError, ValueError) as error:
-            module = entry.module if isinstance(error, SceneError) else None
+            module = entry.files.get("module") if isinstance(error, SceneError) else None
             faults += [(module, f"{where}: {fault}") for fault in getattr(error, "errors", [error])]
     if faults:  # each file once
         messages = {module or fault: fault for module, fault in reversed(faults)}
@@ -67,7 +68,9 @@ def custom_forces(scene: MolecularScene) -> list[object]:
     return forces
 
 
-def _custom(scene: MolecularScene, entry: CustomForce | BodyForce, key: str) -> object:
+def _custom(scene: MolecularScene, entry: AddedForce, key: str) -> object:
+    if not isinstance(entry, CustomForce | BodyForce):
+        return entry
     if entry.module is None and isinstance(entry, BodyForce):
         return potential_of_scene(entry, scene.path)
     if entry.module is None and isinstance(entry, CustomForce):
@@ -208,11 +211,12 @@ def bind(force: object, system: System, name: str) -> BoundTerm:
     return _bind_term(force, system)
 
 
-def _bind_term(made: object, system: System) -> BoundTerm:
+def _bind_term(force: object, system: System) -> BoundTerm:
     """A finished term, or an object whose method `term` makes it for a system."""
-    if isinstance(made, TermMaker):
+    made = force
+    if isinstance(force, TermMaker):
         try:
-            made = made.term(system)
+            made = force.term(system)
         except (ValueError, SceneError):
             raise
         except (Exception, SystemExit) as error:  # user code may raise anything
@@ -229,6 +233,8 @@ def _bind_term(made: object, system: System) -> BoundTerm:
             f" {compiled}"
         )
     term = cast(NamedTuple, made)
+    if isinstance(force, AddedForce):
+        return BoundTerm(term, ", ".join(f"{key} = {x}" for key, x in force))
     numbers = ", ".join(
         f"{key} = {x:.6g}" for key, x in term._asdict().items() if isinstance(x, int | float)
     )

@@ -1,9 +1,14 @@
-"""A pair potential added by two files."""
+"""A pair potential added by one file."""
 
 import json
+import os
+import shutil
+import subprocess
+import sys
+import zlib
 
 import pytest
-from support.changed_package import edited, run_with_files
+from support.common import ROOT
 
 SOFT = """
 from typing import NamedTuple
@@ -12,33 +17,14 @@ import numpy as np
 
 from rigidmd.compile import implements
 from rigidmd.compile.simd import inverse_square_root
+from rigidmd.features.potentials.pairs import pair_forces
 from rigidmd.forces.neighbors import pair_loop
-from rigidmd.forces.parts import Interactions
+from rigidmd.scene.added_forces import AddedForce
+from rigidmd.scene.validation import Positive
 from rigidmd.units import KJ_PER_MOL
 
 
-class SoftRepulsion(NamedTuple):
-    cutoff: float  # Å
-    strength: float  # u Å²/ps²
-
-    def for_slots(self, slots, dtype):
-        return self
-
-
-def interactions(parts):
-    keys = parts.scene.forces.soft_repulsion
-    sites = parts.sites([np.arange(len(m.masses)) for m in parts.species])
-    potential = SoftRepulsion(keys.range_A, keys.strength_kJ_mol * KJ_PER_MOL)
-    return Interactions({"soft_repulsion": parts.pair_forces(potential, sites)}, {}, notes=("a soft note",))
-
-
-@implements(pair_loop.pair, SoftRepulsion, inline=True)
-def _pair(potential, i, j, r2):
-    inverse = inverse_square_root(r2)
-    left = 1.0 - r2 * inverse * (1 / potential.cutoff)
-    return potential.strength * left * left, (2.0 * potential.strength / potential.cutoff) * left * inverse
-"""
-SOFT_KEYS = """class SoftRepulsion(Section):
+class SoftRepulsion(AddedForce):
     \"\"\"A soft repulsion of all sites: strength (1 - r/range)².\"\"\"
 
     strength_kJ_mol: Positive
@@ -46,12 +32,24 @@ SOFT_KEYS = """class SoftRepulsion(Section):
     range_A: Positive = 5.0
     \"\"\"Where it ends\"\"\"
 
+    def term(self, system):
+        sites = [np.arange(len(m.masses)) for m in system.species]
+        return pair_forces(Soft(self.range_A, self.strength_kJ_mol * KJ_PER_MOL), system, sites)
 
-class Forces(Section):
-    \"\"\"Forces between sites of different molecules.\"\"\"
 
-    soft_repulsion: SoftRepulsion | None = None
-    \"\"\"A soft repulsion\"\"\"
+class Soft(NamedTuple):
+    cutoff: float  # Å
+    strength: float  # u Å²/ps²
+
+    def for_slots(self, slots, dtype):
+        return self
+
+
+@implements(pair_loop.pair, Soft, inline=True)
+def _pair(potential, i, j, r2):
+    inverse = inverse_square_root(r2)
+    left = 1.0 - r2 * inverse * (1 / potential.cutoff)
+    return potential.strength * left * left, (2.0 * potential.strength / potential.cutoff) * left * inverse
 """
 SOFT_SCENE = """
 precision = "double"
@@ -76,6 +74,7 @@ SOFT_SCRIPT = """
 import json
 from pathlib import Path
 import numpy as np
+import rigidmd
 from support.common import shaken
 from rigidmd import Scene
 from rigidmd.assemble.build import build
@@ -119,36 +118,47 @@ for threads in (1, 2):
 print(json.dumps({
     "energy": tallies["soft_repulsion"].energy, "expected": expected, "force_error": error, "force": abs(force).max(),
     "same_bits": ends[0] == ends[1], "check": describe(scene), "without": describe(Scene.from_dict(data)),
-    "schema": list(schema()["$defs"]["SoftRepulsion"]["properties"]),
+    "column": system.more_columns["soft_repulsion"].header, "file": rigidmd.__file__,
+    "schema": list(schema()["$defs"]["Forces"]["properties"]["soft_repulsion"]["properties"]),
     "errors": [messages({}), messages({"strength_kJ_mol": 1.0, "range": 3.0})],
 }))
 """
 
 
-def test_adding_a_pair_potential_takes_two_files(tmp_path):
-    files = {
-        "scene/forces.py": edited(
-            "scene/forces.py",
-            (
-                'class Forces(Section):\n    """Forces between sites of different molecules."""\n',
-                SOFT_KEYS,
-            ),
-            (
-                "POTENTIALS = {",
-                'POTENTIALS = {"soft_repulsion": ("soft repulsion", "not in [forces]"), ',
-            ),
-        ),
-        "forces/potentials/soft_repulsion.py": SOFT,
-    }
-    assert len(files) == 2
+def run_with_file(folder, script):
+    """The last line that a script prints in a copy of the package with the potential. Its class is
+    named by the text, because compiled code is found by its name."""
+    shutil.copytree(
+        ROOT / "rigidmd", folder / "rigidmd", ignore=shutil.ignore_patterns("docs", "__pycache__")
+    )
+    (folder / "systems").symlink_to(ROOT / "systems")
+    text = SOFT.replace("Soft(", f"Soft{zlib.crc32(SOFT.encode()):x}(").replace(
+        "Soft,", f"Soft{zlib.crc32(SOFT.encode()):x},"
+    )
+    (folder / "rigidmd/features/potentials/pairs/soft_repulsion.py").write_text(text)
+    paths = os.pathsep.join([str(folder), str(ROOT / "tests")])
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": paths},
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout.splitlines()[-1]
+
+
+def test_adding_a_pair_potential_takes_one_file(tmp_path):
     (tmp_path / "soft.toml").write_text(SOFT_SCENE)
-    found = json.loads(run_with_files(tmp_path, files, SOFT_SCRIPT).splitlines()[-1])
+    found = json.loads(run_with_file(tmp_path, SOFT_SCRIPT))
     assert found["energy"] == pytest.approx(found["expected"], rel=1e-12)
     assert found["force_error"] < 1e-6 * found["force"]
     assert found["same_bits"]
-    assert "soft repulsion: 180 sites" in found["check"] and "  a soft note\n" in found["check"]
+    assert "soft repulsion: strength_kJ_mol = 3.0, range_A = 5.0" in found["check"]
     assert "\n  Lennard-Jones: lennard_jones is false\n" in found["check"]
-    assert "\n  soft repulsion: not in [forces]\n" in found["without"]
+    assert found["column"] == "soft_repulsion (kJ/mole)"
+    assert found["file"].endswith("rigidmd/__init__.py") and str(tmp_path) in found["file"]
+    assert "soft_repulsion" not in found["without"]
     assert found["schema"] == ["strength_kJ_mol", "range_A"]
     assert found["errors"][0] == ["forces.soft_repulsion.strength_kJ_mol: is missing"]
     assert "did you mean range_A?" in found["errors"][1][0]
