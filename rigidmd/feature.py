@@ -44,6 +44,8 @@ class Row:
     commands: tuple[str, ...] = ()  # modules of its folder `commands`
     formats: tuple[str, ...] = ()  # modules that register file formats
     analyses: tuple[str, ...] = ()  # modules that register analyses
+    #: Modules that have the name of an analysis which needs no run, with `results_of_scene`
+    scene_analyses: tuple[str, ...] = ()
     #: Modules with an analysis of all points of a sweep, SWEEP_ANALYSIS
     sweep_analyses: tuple[str, ...] = ()
     programs: tuple[str, ...] = ()  # folders with a program, see `core.programs`

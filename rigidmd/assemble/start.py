@@ -13,6 +13,7 @@ from rigidmd.dynamics.model import Model, draw_momenta, mobile, remove_momentum
 from rigidmd.dynamics.noise import LATTICE, MOMENTA
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, StructureError
+from rigidmd.features import modules
 from rigidmd.forces.ewald.direct_sum import SAME_BASIS
 from rigidmd.forces.fields.walls import range_of_centres
 from rigidmd.forces.parts import gather_per_molecule
@@ -135,8 +136,12 @@ def rest_errors(system: System) -> list[str]:
     """A message if no molecule can move."""
     if not len(system.model.species) or mobile(system.model).any():
         return []
-    why = "molecules: all are frozen. Nothing would move. Insertion needs no run:"
-    return [f"{why} `rigidmd analyse {system.scene.source} insertion model=NAME`"]
+    why = "molecules: all are frozen. Nothing would move."
+    advice = [
+        f"{name.title()} needs no run: `rigidmd analyse {system.scene.source} {name} model=NAME`"
+        for name, _ in modules("scene_analyses")
+    ]
+    return [" ".join([why, *advice])]
 
 
 def output_errors(system: System) -> list[str]:

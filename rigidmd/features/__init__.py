@@ -43,6 +43,7 @@ FEATURES = (
         sweep_analyses=("windows", "lambda_sweep"),
         commands=("virial",),
         analyses=("insertion",),
+        scene_analyses=("insertion",),
     ),
     Row(
         "studies",
@@ -73,7 +74,7 @@ FEATURES = (
 
 def modules(kind: str) -> Iterator[tuple[str, str]]:
     """(name, full name) of the modules of installed features that add "commands", "formats",
-    "analyses", "sweep_analyses", "thermostats" or "barostats"."""
+    "analyses", "sweep_analyses", "scene_analyses", "thermostats" or "barostats"."""
     for row in FEATURES:
         if getattr(row, kind) and row.is_installed:
             folder = f"{row.package}.commands" if kind == "commands" else row.package

@@ -19,7 +19,8 @@ from rigidmd.features.analysis.conditions import (
     static,
     trajectory,
 )
-from rigidmd.features.analysis.options import Count, Seed, Temperature
+from rigidmd.features.analysis.files import run_analyses
+from rigidmd.features.analysis.options import Count, Seed, Temperature, check_options
 from rigidmd.features.analysis.registry import built_in
 from rigidmd.features.analysis.result import (
     BLOCKS,
@@ -31,13 +32,15 @@ from rigidmd.features.analysis.result import (
     mean_of_series,
     too_short,
 )
-from rigidmd.features.analysis.rigid_frames import RigidFrames
+from rigidmd.features.analysis.rigid_frames import RigidFrames, frames_of_start
 from rigidmd.features.analysis.runs import Runs
 from rigidmd.features.free_energy.guest import Guest, model_named
 from rigidmd.mechanics.rotation import random_rotations
+from rigidmd.scene import MolecularScene
 from rigidmd.units import BAR, BOLTZMANN, KJ_PER_MOL
 
 TRIALS = 1000  # in each frame
+FRAMES = 100  # equal ones, without a run
 MOST_TRIALS = 5e7  # 8 bytes each in several arrays
 #: The sum of the weights must be worth this number of equal trials, and of equal frames.
 FEWEST_TRIALS, FEWEST_FRAMES = 100.0, 5.0
@@ -144,6 +147,20 @@ def insertion(
     if axis:
         result.curves = [_profile(sets, thermal, axis)]
     return result
+
+
+def results_of_scene(
+    path: str, options: dict[str, object]
+) -> tuple[list[AnalysisResult], dict[str, str]]:
+    """Insertion into the frozen molecules of a scene, without a run: results, and messages on what
+    failed. Raises OutputError."""
+    check_options([insertion], options)
+    model = str(options.get("model", ""))
+    runs = Runs((frames_of_start(MolecularScene.read(path), FRAMES, model),))
+    results, failed = run_analyses(runs, ["insertion"], options={"zero_loading": True} | options)
+    for result in results:  # trials at rest have no time
+        result.values = [value._replace(correlation_ps=None) for value in result.values]
+    return results, failed
 
 
 def _left_out(runs: Runs, guest: Guest, host: np.ndarray) -> str:

@@ -1,13 +1,13 @@
 """`rigidmd analyse`."""
 
 import argparse
+from importlib import import_module
 from pathlib import Path
 
 from rigidmd.commands import FAILED
 from rigidmd.commands.arguments import Options, argument, command, flag, number, repeated, time_ps
 from rigidmd.commands.streams import progress_bar
-
-FRAMES = 100  # equal ones, for insertion without a run
+from rigidmd.features import modules
 
 
 class _List(argparse.Action):
@@ -114,7 +114,7 @@ def _analyse(options: Options) -> int:
     names = [*options.only, *(text for text in options.requests if "=" not in text)]
     more = dict(parse_override(text) for text in options.requests if "=" in text)
     if options.folder.endswith(".toml"):
-        return _insert(options.folder, names, more, verbose=options.verbose)
+        return _analyse_scene(options.folder, names, more, verbose=options.verbose)
     with progress_bar() as progress:
         folder = Path(options.folder)
         request = (names, options.start, options.viscosity)
@@ -146,27 +146,18 @@ def _analyse(options: Options) -> int:
     return FAILED if names and done.failed else 0
 
 
-def _insert(path: str, names: list[str], more: dict[str, object], *, verbose: bool) -> int:
-    """Print the results of insertion into the frozen molecules of a scene."""
+def _analyse_scene(path: str, names: list[str], more: dict[str, object], *, verbose: bool) -> int:
+    """Print the results of an analysis that needs no run."""
     from rigidmd.errors import OutputError
-    from rigidmd.features.analysis.files import run_analyses
-    from rigidmd.features.analysis.options import check_options
-    from rigidmd.features.analysis.registry import known
-    from rigidmd.features.analysis.rigid_frames import frames_of_start
-    from rigidmd.features.analysis.runs import Runs
-    from rigidmd.scene import MolecularScene
 
-    if names != ["insertion"]:
+    of_scenes = dict(modules("scene_analyses"))
+    if len(names) != 1 or names[0] not in of_scenes:
+        known = " or ".join(of_scenes)
         raise OutputError(
-            f"{path} is a scene, and only insertion needs no run: `rigidmd analyse {path} insertion"
+            f"{path} is a scene, and only {known} needs no run: `rigidmd analyse {path} {known}"
             " model=NAME`, or `rigidmd run` first"
         )
-    check_options([known()["insertion"].function], more)
-    model = str(more.get("model", ""))
-    runs = Runs((frames_of_start(MolecularScene.read(path), FRAMES, model),))
-    results, failed = run_analyses(runs, names, options={"zero_loading": True} | more)
-    for result in results:  # trials at rest have no time
-        result.values = [value._replace(correlation_ps=None) for value in result.values]
+    results, failed = import_module(of_scenes[names[0]]).results_of_scene(path, more)
     print_results(results, failed, verbose=verbose)
     return FAILED if failed else 0
 
