@@ -27,7 +27,6 @@ from rigidmd.forces.parts import Interactions, SystemParts, sum_of_tails
 from rigidmd.forces.terms import trait
 from rigidmd.mechanics.free_rotor import NoRotor
 from rigidmd.scene import MolecularScene
-from rigidmd.scene.ensembles import BAROSTATS, THERMOSTATS
 from rigidmd.scene.fields import FIELDS, field_notes
 from rigidmd.scene.forces import ELECTROSTATICS, POTENTIALS
 from rigidmd.scene.stage import Stage
@@ -105,10 +104,14 @@ def _ensemble_errors(system: System) -> list[str]:
             return errors
     driven = [name for name, term in system.terms.items() if trait(type(term), "time_dependent")]
     why = (
-        "hybrid_monte_carlo needs an energy that does not depend on time, and"
-        f" {', '.join(driven)} do: choose another thermostat"
+        f"needs an energy that does not depend on time, and {', '.join(driven)} do: choose another"
+        " thermostat"
     )
-    return [f"stages.{k}: {why}" for k, stage in stages if stage.is_hybrid and driven]
+    return [
+        f"stages.{k}: {stage.thermostat_kind} {why}"
+        for k, stage in stages
+        if stage.in_trajectories and driven
+    ]
 
 
 def _system_notes(system: System) -> list[str]:
@@ -269,11 +272,9 @@ def integrator_of_stage(system: System, k: int) -> Scheme:
         if (user := system.user_thermostat(k)) is not None:
             scheme = scheme.with_thermostat(user, halved=cast("UserThermostat", user).halved)
     elif stage.has_thermostat:
-        kind = THERMOSTATS[stage.thermostat_kind]
-        scheme = kind.joined(scheme, thermostat_of(system, k), stage)
+        scheme = stage.thermostat_method.joined(scheme, thermostat_of(system, k), stage)
     if stage.has_barostat:
-        kind = BAROSTATS[stage.barostat_kind]
-        scheme = kind.joined(scheme, barostat_of(system, k), stage)
+        scheme = stage.barostat_method.joined(scheme, barostat_of(system, k), stage)
     if system.keeps_momentum_in(k) and (interval := system.removes_momentum_every) is not None:
         scheme = scheme.with_momentum_removal(stage.steps_of(interval))
     return scheme
@@ -283,7 +284,7 @@ def thermostat_of(system: System, k: int) -> NamedTuple:
     stage = system.scene.stages[k]
     thermal = _thermal(stage)
     key = noise.key_of(system.scene.seed, noise.THERMOSTAT, k)
-    module = import_module(THERMOSTATS[stage.thermostat_kind].flow)
+    module = import_module(stage.thermostat_method.flow)
     return module.thermostat(stage, thermal, system.freedom_in(k), key)
 
 
@@ -304,7 +305,7 @@ def barostat_of(system: System, k: int) -> NamedTuple:
         (0.0, 0.0) if system.tail is None else system.tail[:2],
         key,
     )
-    module = import_module(BAROSTATS[stage.barostat_kind].flow)
+    module = import_module(stage.barostat_method.flow)
     return module.barostat(stage, confinement)
 
 

@@ -1,7 +1,7 @@
 """Descriptions of stages: steps, thermostat and barostat, sampled distribution, conserved
 quantities."""
 
-from rigidmd.scene.ensembles import BAROSTATS, COMPRESSIBILITY, THERMOSTATS
+from rigidmd.scene.ensembles import COMPRESSIBILITY
 from rigidmd.scene.stage import Stage
 
 #: Range of compressibilities (1/bar): diamond, a gas at 0.01 bar.
@@ -55,7 +55,7 @@ def describe_stage(stage: Stage) -> list[str]:
         choice = f"integrator and step chosen at its start for an error of {error}"
         text = f"{stage.label}: {stage.duration_ps:g} ps, {choice}"
     if stage.has_thermostat:
-        kind = THERMOSTATS[stage.thermostat_kind]
+        kind = stage.thermostat_method
         described = kind.describe(stage.thermostat_values)
         text += f", {_ramp(stage.temperatures)} K by {kind.title}, {described}"
     if stage.has_barostat:
@@ -72,7 +72,7 @@ def describe_stage(stage: Stage) -> list[str]:
 
 
 def _barostat(stage: Stage) -> str:
-    kind = BAROSTATS[stage.barostat_kind]
+    kind = stage.barostat_method
     values = stage.barostat_values
     text = f"{_pressure(stage)} bar by {kind.title}, {stage.pressure_coupling.replace('_', '-')}"
     if "barostat_time_ps" in values:

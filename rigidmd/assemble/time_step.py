@@ -39,7 +39,7 @@ MIXED_EWALD_ERROR = 3e-6
 #: Verlet: 0.007 at 2 fs, 0.026 at 4 fs), and in the middle of the drift (SPC/E at 4 fs: 0.0023(5)
 #: and 0.004(1) in two series).
 BIAS_AT_ENDS, BIAS_IN_MIDDLE = (0.6, 0.002), (0.1, 0.005)
-#: Largest error of a default step without a thermostat, or with hybrid Monte Carlo: 2 fs for water.
+#: Largest error of a default step without a thermostat, or of tested trajectories: 2 fs for water.
 DEFAULT_ERROR = 0.0125
 #: Default steps are at most this long, fs: longer ones resolve no collision of argon at 94 K.
 LONGEST_DEFAULT = 10.0
@@ -114,7 +114,7 @@ def _default_step(scene: MolecularScene, stage: Stage, fastest: FastMotion | Non
     if fastest is None or scene.forces.added or scene.from_python:
         return USUAL_STEP
     error = DEFAULT_ERROR
-    if stage.has_thermostat and not (stage.is_hybrid or scene.engine.is_external):
+    if stage.has_thermostat and not (stage.in_trajectories or scene.engine.is_external):
         per_error, largest = _bias_of(stage)
         error = largest / per_error
     longest = _longest_angle(stage.scheme, error) * fastest.time / FEMTOSECOND
@@ -174,7 +174,7 @@ def describe_step(scene: MolecularScene, species: list[Molecule], k: int) -> str
         f"time-step error: {fastest.molecule} {fastest.does} as if forces were wrong by"
         f" {_one_digit(100 * error)} %"
     )
-    if stage.is_hybrid:
+    if stage.in_trajectories:
         return f"{text}. Averages have none"
     if stage.has_thermostat:
         bias = _bias_of(stage)[0] * error
@@ -270,8 +270,8 @@ def _accuracy_warning(stage: Stage, fastest: FastMotion, temperature: float) -> 
     dt = stage.step
     limit = fastest.longest_step(stage)
     error = step_error(stage.scheme, dt / fastest.time)
-    # hybrid Monte Carlo corrects the error of its steps
-    if dt > limit or error <= INACCURATE or stage.is_hybrid:
+    # a test of trajectories corrects the error of their steps
+    if dt > limit or error <= INACCURATE or stage.in_trajectories:
         return ""
     better = dt
     while step_error(stage.scheme, better / fastest.time) > INACCURATE / 2:
@@ -311,7 +311,7 @@ def with_precision(
     seeks = [
         k
         for k, stage in enumerate(scene.stages)
-        if stage.is_auto and not (stage.bias_kT or stage.is_hybrid)
+        if stage.is_auto and not (stage.bias_kT or stage.in_trajectories)
     ]
     precision, why = "double", "no stage has a given time step"
     if scene.engine.is_external:

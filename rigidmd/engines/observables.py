@@ -100,7 +100,7 @@ def observe(
     moved : whether the engine has just moved this state, so that it may have its forces and
         energies already
     energy_unit : unit of all energies, u Å²/ps²
-    trajectories : the columns `OF_TRAJECTORIES`, if the scene has them
+    trajectories : the columns `OF_FEATURES`, if the scene has them
 
     The pressure is the molecular one, (sum m V V + sum F R)/V over centres of mass (Allen &
     Tildesley 2017, 2.7.2), and kB T/V along each axis along which the total momentum is kept at

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple, get_args, get_type_hint
 import numpy as np
 
 from rigidmd.core.statistics import least_error_from, may_be_unsteady, steady_from
+from rigidmd.features import FEATURES
 
 if TYPE_CHECKING:
     from rigidmd.scene.stage import Stage
@@ -130,14 +131,9 @@ NOT_AVERAGED = {
 }
 
 
-_ENDED = "the trajectories of hybrid Monte Carlo since the line before"
-#: Columns that only scenes with hybrid Monte Carlo have.
-OF_TRAJECTORIES = {
-    "acceptance": Column("Acceptance", "1", f"fraction of {_ENDED} that was accepted"),
-    "abs_dH_kT": Column("abs(dH) (kT)", "kT", f"mean size of the change of the energy in {_ENDED}"),
-    "exp_minus_dH": Column("exp(-dH/kT)", "1", f"mean over {_ENDED}. In equilibrium 1 on average"),
-}
-IN_LOGS = COLUMNS | OF_TRAJECTORIES
+#: Columns that only scenes with a feature have.
+OF_FEATURES = {name: Column(*words) for row in FEATURES for name, *words in row.columns}
+IN_LOGS = COLUMNS | OF_FEATURES
 
 
 def distance_column(k: int) -> tuple[str, Column]:

@@ -12,7 +12,7 @@ from rigidmd.core.state import State
 from rigidmd.core.state_file import SavedState, array_errors
 from rigidmd.dynamics.model import DegreesOfFreedom, Model, mobile
 from rigidmd.engines.cpu.engine import CpuEngine, Precision
-from rigidmd.engines.samples import OF_TRAJECTORIES, Column, distance_column, energy_column
+from rigidmd.engines.samples import OF_FEATURES, Column, distance_column, energy_column
 from rigidmd.engines.sites import Sites
 from rigidmd.forces.fields.distances import DistanceRestraint
 from rigidmd.forces.neighbors.pair_loop import PairForces
@@ -188,8 +188,8 @@ class System:
         columns |= dict(distance_column(int(name.rpartition("_")[2])) for name in self.distances)
         for extra in self.extras.values():
             columns |= extra.columns
-        if any(stage.is_hybrid for stage in self.scene.stages):
-            columns |= OF_TRAJECTORIES
+        for stage in self.scene.stages:
+            columns |= {name: OF_FEATURES[name] for name in stage.thermostat_method.columns}
         return columns
 
     @property

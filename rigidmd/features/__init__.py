@@ -5,6 +5,8 @@ from operator import attrgetter
 
 from rigidmd.feature import Feature, Row
 
+_ENDED = "the trajectories of hybrid Monte Carlo since the line before"
+
 FEATURES = (
     Row(
         "bodies",
@@ -58,7 +60,26 @@ FEATURES = (
         "CIF and symmetry, and the formats that liquids do not need",
         formats=("cif", "g96", "gsd", "lammps"),
     ),
-    Row("monte_carlo", "hybrid Monte Carlo", thermostats=("keys",)),
+    Row(
+        "monte_carlo",
+        "hybrid Monte Carlo",
+        thermostats=("keys",),
+        columns=(
+            ("acceptance", "Acceptance", "1", f"fraction of {_ENDED} that was accepted"),
+            (
+                "abs_dH_kT",
+                "abs(dH) (kT)",
+                "kT",
+                f"mean size of the change of the energy in {_ENDED}",
+            ),
+            (
+                "exp_minus_dH",
+                "exp(-dH/kT)",
+                "1",
+                f"mean over {_ENDED}. In equilibrium 1 on average",
+            ),
+        ),
+    ),
     Row("calculators", "ASE calculators, both ways", needs=("potentials",)),
     Row(
         "view",

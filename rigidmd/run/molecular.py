@@ -22,7 +22,7 @@ from rigidmd.dynamics.model import remove_momentum
 from rigidmd.dynamics.observables import largest_values
 from rigidmd.engines.observables import Observation, describe_quantities, observe
 from rigidmd.engines.protocol import Engine, NotFiniteError
-from rigidmd.engines.samples import OF_TRAJECTORIES, Samples
+from rigidmd.engines.samples import OF_FEATURES, Samples
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, SimulationError, StructureError
 from rigidmd.features import acting_on, used_by
@@ -320,7 +320,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         stage = self.scene.stages[k]
         step = self.scene.stages[k].step
         for force in self.system.python_forces.values():
-            force.may_diverge = stage.is_hybrid
+            force.may_diverge = stage.in_trajectories
         if stage.is_minimisation:
             return Segment(
                 stage.scheme, step, 0, action=None if k in self.record.minima else self._minimise
@@ -458,7 +458,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             correction = self._integrator(moment.stage).kinetic_correction * step**2
         # an external engine may not report the heat of its thermostat
         conserves = not stage.is_minimisation and self.engine.conserves_energy
-        trajectories = tuple(nan for name in self.system.more_columns if name in OF_TRAJECTORIES)
+        trajectories = tuple(nan for name in self.system.more_columns if name in OF_FEATURES)
         if (sums := self.engine.trajectories) is not None:
             samples = self._sampler.samples
             of_stage = len(samples) > 0 and samples.row(-1).stage == moment.stage

@@ -98,7 +98,7 @@ class Sampler(Observer):
         self._run, self._check = run, check
         self._warns = acting_on(run.scene)  # each once
         self.trajectories = np.zeros(5)  # see `Engine.trajectories`, at the last sample
-        if any(stage.is_hybrid for stage in run.scene.stages):
+        if any(stage.in_trajectories for stage in run.scene.stages):
             self.remembers = self.remembers | {"trajectories": np.ndarray}
         # stage -> row of the last sample before it, or of the first
         self._begins: dict[int, int] = {}

@@ -19,7 +19,6 @@ from rigidmd.engines.samples import (
     equilibrated,
 )
 from rigidmd.engines.system import System
-from rigidmd.scene.ensembles import THERMOSTATS
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, BOLTZMANN, COULOMB, FEMTOSECOND, KJ_PER_MOL
 
@@ -29,14 +28,13 @@ if TYPE_CHECKING:
 #: Columns of which stages have means -> the units in the keys.
 TEMPERATURES = {name: "K" for name in COLUMNS if name.startswith("temperature")}
 BOX = {"density": "g_cm3", "a": "A", "b": "A", "c": "A"}
-HYBRID = {"acceptance": "mean", "abs_dH_kT": "mean", "exp_minus_dH": "mean"}
 #: The second half of a stage has notes if it has enough samples, on effects larger than some
 #: standard errors. A drift is significant from there on: in random walks of the energy its errors
 #: are up to 1.5 times too small (`slope`).
 MIN_SAMPLES, STANDARD_ERRORS = 20, 4.0
 #: Drift of the conserved energy per degree of freedom, kT/ns, and its sum over the time, kT.
 DRIFT_LIMIT, DRIFT_SUM_LIMIT = 0.1, 1e-3
-#: Smallest fraction of accepted trajectories of hybrid Monte Carlo without a note.
+#: Smallest fraction of accepted trajectories without a note.
 LEAST_ACCEPTANCE = 0.2
 #: Largest error of the temperature by the step, and difference of T_trans and T_rot, without a
 #: note, as fractions of the temperature.
@@ -212,7 +210,7 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
     of the ensemble.
     """
     of_stage = samples.of_stage(k)
-    if system.scene.stages[k].is_hybrid:  # its averages have no time-step error
+    if system.scene.stages[k].in_trajectories:  # its averages have no time-step error
         return _notes_on_trajectories(system.scene.stages[k], k, of_stage["acceptance"])
     half = len(of_stage) // 2
     if len(of_stage) - half < MIN_SAMPLES:
@@ -249,7 +247,7 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
     from rigidmd.assemble.build import integrator_of_stage  # not for single bodies
 
     scheme = integrator_of_stage(system, k)
-    if scheme.kinetic_correction == 0 and not stage.is_hybrid:
+    if scheme.kinetic_correction == 0 and not stage.in_trajectories:
         squares = (of_stage["force_squares"] + of_stage["torque_squares"])[half:]
         step = stage.step
         per_square = 2 * scheme.shadow_correction * step**2 * KJ_PER_MOL / BOLTZMANN
@@ -298,7 +296,7 @@ def _note_on_heating(
 
 
 def _notes_on_trajectories(stage: Stage, k: int, acceptance: np.ndarray) -> list[str]:
-    """A note if few trajectories of hybrid Monte Carlo were accepted, in the second half of enough
+    """A note if few trajectories were accepted, in the second half of enough
     samples, or if none was.
 
     acceptance : (t,) between samples, NaN where no trajectory ended
@@ -329,7 +327,7 @@ def drift_of_thermostats(system: System, of_stage: Samples, k: int) -> tuple[flo
     freedom = system.freedom_in(k)
     if not (stage.has_thermostat and freedom.translation and freedom.rotation):
         return 0.0, 0.0
-    if not THERMOSTATS[stage.thermostat_kind].by_motion:
+    if not stage.thermostat_method.by_motion:
         return 0.0, 0.0
     from rigidmd.assemble.build import integrator_of_stage  # not for single bodies
 
@@ -454,8 +452,9 @@ def stage_summary(
         freedom = system.freedom_in(k).total
         square = 2 * level.mean() ** 2 / freedom - level.var() if freedom else 0.0
         values["temperature_scatter_K"] = sqrt(square) if square > 0 else None
-    if stage.is_hybrid:
-        values |= {"trajectories": steps // stage.steps_together} | _means(steady, HYBRID)
+    if stage.in_trajectories:
+        values |= {"trajectories": steps // stage.steps_together}
+        values |= _means(steady, dict.fromkeys(stage.thermostat_method.columns, "mean"))
     if stage.volume:
         values |= _means(equilibrated(before, earlier), {"volume": "nm3"}) | {
             "volume_before_nm3": first.volume

@@ -84,7 +84,25 @@ class Thermostat(EnsembleMethod):
     #: Whether translation and rotation each have a thermostat, which relaxes their kinetic energy
     #: to its mean in the time constant.
     by_motion: bool = False
-    in_trajectories: bool = False  # whether steps are accepted or rejected together
+    #: The key with the number of steps that are accepted or rejected together, in trajectories, so
+    #: that averages have no time-step error. Empty: steps are not tested.
+    steps_key: str = ""
+    #: Why analyses of motion in time refuse its states. Empty: they do not.
+    no_motion: str = ""
+    #: Module whose `choose_for_stage` chooses integrator and step for integrator = "auto". Empty:
+    #: they follow from the error that is set.
+    pilot: str = ""
+    #: Columns of the log that only its stages have, see `features.FEATURES`.
+    columns: tuple[str, ...] = ()
+
+    @property
+    def in_trajectories(self) -> bool:
+        """Whether steps are accepted or rejected together."""
+        return bool(self.steps_key)
+
+    def steps_together(self, values: Values) -> int:
+        """Steps that are accepted or rejected together."""
+        return int(values[self.steps_key])
 
     @property
     def flow(self) -> str:
@@ -125,3 +143,7 @@ class Barostat(EnsembleMethod):
     def joined(self, scheme: Scheme, barostat: tuple, stage: StageKeys) -> Scheme:
         """A scheme with its flow. barostat : its record, see `dynamics.barostats`"""
         return scheme.with_barostat(barostat, stage.moves_every)
+
+
+#: Those of a stage without one.
+NO_THERMOSTAT, NO_BAROSTAT = Thermostat(), Barostat()

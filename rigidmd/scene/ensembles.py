@@ -18,8 +18,6 @@ Six = tuple[float, float, float, float, float, float]
 
 #: Compressibility of water at 298 K and 1 bar, 1/bar.
 COMPRESSIBILITY = 4.5e-5
-#: Length of the lines of descriptions, as of docstrings.
-LINE = 93
 
 
 def _methods_of(package: ModuleType) -> list:
@@ -44,11 +42,16 @@ DEFAULT_THERMOSTAT = next(iter(THERMOSTATS))
 BAROSTATS = {kind.name: kind for kind in _BAROSTATS}
 
 
+def in_lines(text: str) -> str:
+    """A description in the lines of a docstring."""
+    return fill(text, 95, initial_indent=3 * " ").lstrip()
+
+
 def _times(methods: Iterable[EnsembleMethod]) -> str:
     """What the common key of times is to each method."""
     *first, last = [method.time_is for method in methods if method.time_is]
     text = f"{', '.join(first)}, or {last}"
-    return fill(text[0].upper() + text[1:], LINE)
+    return in_lines(text[0].upper() + text[1:])
 
 
 class CommonThermostatKeys(Section):

@@ -499,7 +499,9 @@ class MolecularScene(CouplingKeys, MatterKeys):
                     and taken < MOST_STEPS * stage.step
                     and abs(taken - duration) > 1e-9 * duration
                 ):
-                    together = f"trajectories of {stage.steps_together} " if stage.is_hybrid else ""
+                    together = (
+                        f"trajectories of {stage.steps_together} " if stage.in_trajectories else ""
+                    )
                     unit = f"a whole number of {together}steps of {stage.step_fs:g} fs"
                     stages_of.setdefault((key, duration, unit, taken), []).append(f"stages.{k}")
         return [

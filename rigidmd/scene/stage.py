@@ -7,7 +7,15 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from rigidmd.core.integrators import AUTO, SCHEMES, SOLVERS, WITH_THERMOSTAT, Rotor, auto_errors
-from rigidmd.scene.ensemble_methods import BAROSTAT_TIME, EnsembleMethod, Values
+from rigidmd.scene.ensemble_methods import (
+    BAROSTAT_TIME,
+    NO_BAROSTAT,
+    NO_THERMOSTAT,
+    Barostat,
+    EnsembleMethod,
+    Thermostat,
+    Values,
+)
 from rigidmd.scene.ensembles import (
     BAROSTATS,
     COMPRESSIBILITY,
@@ -16,6 +24,7 @@ from rigidmd.scene.ensembles import (
     BarostatKeys,
     Six,
     ThermostatKeys,
+    in_lines,
 )
 from rigidmd.scene.integrators import VERLET_ELSEWHERE, MovedByScheme, advise_on_integrator
 from rigidmd.scene.validation import (
@@ -83,6 +92,14 @@ OTHER_INTEGRATORS = {
 USUAL_STEP = 2.0
 
 
+#: Thermostats whose averages have no time-step error, in the description of `integrator`.
+_EXCEPTIONS = "".join(
+    f", except with {name}, which corrects it"
+    for name, kind in THERMOSTATS.items()
+    if kind.in_trajectories
+)
+
+
 class Timing(Section):
     """The first keys of a stage."""
 
@@ -111,13 +128,15 @@ class Timing(Section):
 class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     """A part of a run with one ensemble and one time step."""
 
-    integrator: Annotated[str, NameIn((*SCHEMES, *WITH_THERMOSTAT, AUTO), in_scene=True)] = (
-        "velocity_verlet"
+    integrator: Annotated[str, NameIn((*SCHEMES, *WITH_THERMOSTAT, AUTO), in_scene=True)] = Field(
+        default="velocity_verlet",
+        description=in_lines(
+            "Scheme of kicks and drifts. baoab: the thermostat acts in the middle of the drift."
+            " auto: the scheme and step that keep the requested error with the fewest force"
+            " evaluations. Default: baoab with nvt and npt, whose averages have almost no time-step"
+            f" error{_EXCEPTIONS}, else velocity_verlet"
+        ),
     )
-    """Scheme of kicks and drifts. baoab: the thermostat acts in the middle of the drift. auto: the
-    scheme and step that keep the requested error with the fewest force evaluations. Default: baoab
-    with nvt and npt, whose averages have almost no time-step error, except with
-    hybrid_monte_carlo, which corrects it, else velocity_verlet"""
     energy_error_kT: Positive | None = None
     """With auto: rms error of the energy over the whole stage, in kT per degree of freedom, as
     predicted by pilot runs"""
@@ -190,7 +209,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             and not self.is_minimisation
         ):
             yield f"{self.integrator} contains a thermostat, but {self.ensemble} has none"
-        if self.integrator in WITH_THERMOSTAT and self.is_hybrid:
+        if self.integrator in WITH_THERMOSTAT and self.in_trajectories:
             yield (
                 f"{self.integrator} contains a thermostat of its own: name another one for"
                 f" {self.thermostat_kind}"
@@ -203,7 +222,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         yield from self._coupling_errors()
         targets = {key: getattr(self, key) for key in ERROR_TARGETS}
         step_keys = [key for key in ("timestep_fs", "rotor") if self._is_given(key)]
-        if self.is_hybrid and self.is_auto:
+        if self.in_trajectories and self.is_auto:
             if set_keys := [key for key, target in targets.items() if target is not None]:
                 kind = self.thermostat_kind
                 yield (
@@ -219,7 +238,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         elif not self.steps_together < MOST_STEPS:
             yield (
                 f"a trajectory of {self.thermostat_kind} is more than {MOST_STEPS:g} steps: set"
-                " trajectory_steps or a longer timestep_fs"
+                f" {self.thermostat_method.steps_key} or a longer timestep_fs"
             )
         if self.duration < 0.5 * self.step and not self.is_minimisation:
             yield (
@@ -295,7 +314,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     def _barostat_errors(self):
         name = self.barostat_kind
-        kind = BAROSTATS[self.barostat_kind]
+        kind = self.barostat_method
         others = [
             other
             for other in BAROSTATS
@@ -324,19 +343,18 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             return
         step = self.step
         least = pi * step
-        thermostat = THERMOSTATS.get(self.thermostat_kind)
-        barostat = BAROSTATS.get(self.barostat_kind)
-        if thermostat and thermostat.oscillates and self.thermostat_time < least:
+        barostat = self.barostat_method
+        if self.thermostat_method.oscillates and self.thermostat_time < least:
             yield (
                 f"thermostat_time_ps = {self.thermostat_time:g} is a period shorter than pi steps,"
                 f" {least:.3g} ps"
             )
-        if barostat and barostat.oscillates and self.barostat_time < least:
+        if barostat.oscillates and self.barostat_time < least:
             yield (
                 f"barostat_time_ps = {self.barostat_time:g} is a period shorter than pi steps,"
                 f" {least:.3g} ps"
             )
-        moves = self.moves_every * step if barostat and barostat.relaxes_in_moves else 0.0
+        moves = self.moves_every * step if barostat.relaxes_in_moves else 0.0
         if self.barostat_time < moves:
             yield (
                 f"barostat_time_ps = {self.barostat_time:g} is shorter than the {moves:g} ps"
@@ -364,14 +382,17 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     @property
     def steps_together(self) -> int:
-        """Steps of a trajectory of hybrid Monte Carlo, between which nothing is observed, else
+        """Steps that are accepted or rejected together, between which nothing is observed, else
         1."""
-        return int(self.thermostat_values["trajectory_steps"]) if self.is_hybrid else 1
+        if not self.in_trajectories:
+            return 1
+        return self.thermostat_method.steps_together(self.thermostat_values)
 
     @property
-    def is_hybrid(self) -> bool:
-        """Whether the stage samples by hybrid Monte Carlo."""
-        return self.has_thermostat and THERMOSTATS[self.thermostat_kind].in_trajectories
+    def in_trajectories(self) -> bool:
+        """Whether steps are accepted or rejected together, so that averages have no time-step
+        error."""
+        return self.thermostat_method.in_trajectories
 
     @property
     def duration(self) -> float:
@@ -433,14 +454,24 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         return (self.barostat or defaults[0]) if defaults else ""
 
     @property
+    def thermostat_method(self) -> Thermostat:
+        """The thermostat. Without one, it has no keys and no effect."""
+        return THERMOSTATS[self.thermostat_kind] if self.has_thermostat else NO_THERMOSTAT
+
+    @property
+    def barostat_method(self) -> Barostat:
+        """The barostat. Without one, it has no keys and no effect."""
+        return BAROSTATS[self.barostat_kind] if self.has_barostat else NO_BAROSTAT
+
+    @property
     def thermostat_values(self) -> Values:
         """The keys of the thermostat with their values."""
-        return THERMOSTATS[self.thermostat_kind].values(self)
+        return self.thermostat_method.values(self)
 
     @property
     def barostat_values(self) -> Values:
         """The keys of the barostat with their values."""
-        return BAROSTATS[self.barostat_kind].values(self)
+        return self.barostat_method.values(self)
 
     @property
     def temperatures(self) -> tuple[float, float]:
@@ -453,7 +484,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     @property
     def thermostat_time(self) -> float:
         """Time constant of the thermostat, ps. The longer one of langevin."""
-        return THERMOSTATS[self.thermostat_kind].time(self.thermostat_values)
+        return self.thermostat_method.time(self.thermostat_values)
 
     @property
     def pressures(self) -> tuple[Six, Six]:
@@ -487,7 +518,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     @property
     def keeps_momentum(self) -> bool:
         """Whether the thermostat conserves the total momentum."""
-        return not self.has_thermostat or not THERMOSTATS[self.thermostat_kind].on_molecules
+        return not self.thermostat_method.on_molecules
 
 
 def _tensor(pressure: float | tuple[float, float, float] | Six) -> Six:

@@ -142,7 +142,6 @@ REACHING_UP = (
     "io/trajectory.py",
     "io/trajectory_file.py",
     "run/part.py",
-    "run/pilot/sampling.py",
     "run/pilot/stages.py",
     "run/record.py",
     "run/results.py",

@@ -56,7 +56,7 @@ TESTED_BY = {
     " features/free_energy/pose_trials",
     "features/free_energy/test_mean_force.py": "features/free_energy/windows",
     "features/monte_carlo/test_trajectories.py": "features/monte_carlo/keys"
-    " features/monte_carlo/momenta",
+    " features/monte_carlo/momenta features/monte_carlo/pilot",
     "features/potentials/test_custom.py": "features/potentials/user_code/pair_potential"
     " features/potentials/user_code/pair_terms features/potentials/user_code/cutoffs features/potentials/sites/formulas",
     "features/potentials/test_pose_tables.py": "features/potentials/poses/pairs",

@@ -73,8 +73,8 @@ def equilibrium(runs: Runs) -> str:
 def motion(runs: Runs) -> str:
     """A path in time, at constant conditions."""
     for stage in (stage for run in runs.members for stage in run.stages):
-        if stage.is_hybrid:
-            return f"motion in time, and the stage {stage.label} samples by hybrid Monte Carlo"
+        if reason := stage.thermostat_method.no_motion:
+            return f"motion in time, and the stage {stage.label} {reason}"
     return constant_conditions(runs)
 
 

@@ -29,7 +29,10 @@ class HybridMonteCarlo(Thermostat):
     source = "Duane, Kennedy, Pendleton & Roweth 1987, Phys. Lett. B 195, 216"
     keys = HybridMonteCarloKeys
     on_molecules = True
-    in_trajectories = True
+    steps_key = "trajectory_steps"
+    pilot = "rigidmd.features.monte_carlo.pilot"
+    no_motion = "samples by hybrid Monte Carlo"
+    columns = ("acceptance", "abs_dH_kT", "exp_minus_dH")
 
     @property
     def flow(self) -> str:

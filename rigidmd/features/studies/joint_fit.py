@@ -18,7 +18,6 @@ from rigidmd.engines.system import System
 from rigidmd.features.analysis.rigid_frames import production_samples
 from rigidmd.features.studies.extrapolation import BiasFit, MeanAtStep, extrapolate, means_of_runs
 from rigidmd.run.record import Record
-from rigidmd.scene.ensembles import BAROSTATS
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 
@@ -88,8 +87,8 @@ def why_not(stage: Stage) -> str:
         return f"it is for nvt and npt, and the stage is {stage.ensemble}"
     if stage.ramps:
         return "temperature or pressure change during the stage"
-    if stage.is_hybrid:
-        return "hybrid_monte_carlo has no time-step error"
+    if stage.in_trajectories:
+        return f"{stage.thermostat_kind} has no time-step error"
     if moving[0] != moving[-1] or moving[0] != (KICK, 0.5) or abs(drifts - 1) > 1e-12:
         return f"it is for velocity_verlet and baoab, and the integrator is {stage.integrator}"
     if stage.has_barostat and stage.pressure_coupling not in (None, "isotropic"):
@@ -130,7 +129,7 @@ def _conditions(record: Record[System], stage: Stage) -> Conditions:
         freedom.total,
         freedom.rotation,
         stage.scheme.with_thermostat(()).kinetic_correction,
-        stage.has_barostat and BAROSTATS[stage.barostat_kind].reads_momenta,
+        stage.barostat_method.reads_momenta,
     )
 
 

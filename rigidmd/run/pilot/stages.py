@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from fractions import Fraction
+from importlib import import_module
 from math import ceil, gcd, inf, sqrt
 
 from rigidmd.assemble.time_step import fastest_of_scene
@@ -12,7 +13,7 @@ from rigidmd.engines.system import System
 from rigidmd.features.bodies.keys.body import SAMPLES
 from rigidmd.features.bodies.system import Pose
 from rigidmd.run.pilot.choice import choose
-from rigidmd.run.pilot.sampling import choose_for_averages, choose_for_sampling
+from rigidmd.run.pilot.sampling import choose_for_averages
 from rigidmd.run.trial_systems import SPAN_PS, body_trial_system, molecular_trial_system
 from rigidmd.scene import BodyScene
 from rigidmd.scene.stage import Stage
@@ -34,8 +35,8 @@ def choose_for_stage(system: System, state: State, k: int) -> tuple[Stage, str]:
     """Stage k with the integrator and step that are best from this state, and the reason. Raises
     SimulationError."""
     stage = system.scene.stages[k]
-    if stage.is_hybrid:
-        return choose_for_sampling(system, state, k)
+    if module := stage.thermostat_method.pilot:
+        return import_module(module).choose_for_stage(system, state, k)
     return (choose_for_averages if stage.bias_kT else choose_for_molecules)(system, state, k)
 
 

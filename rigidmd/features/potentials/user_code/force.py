@@ -108,7 +108,7 @@ class BoundForce:
 
     calls, seconds : how often it was called, and the time that this took
     may_diverge : whether values that are not finite are passed to the steps, as in trajectories of
-        hybrid Monte Carlo, which are then rejected, else they are an error
+        steps that are then rejected, else they are an error
     """
 
     may_diverge = False
