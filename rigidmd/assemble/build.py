@@ -28,7 +28,7 @@ from rigidmd.forces.terms import trait
 from rigidmd.mechanics.free_rotor import NoRotor
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.fields import FIELDS, field_notes
-from rigidmd.scene.forces import ELECTROSTATICS, POTENTIALS
+from rigidmd.scene.forces import ELECTROSTATICS
 from rigidmd.scene.stage import Stage
 from rigidmd.scene.validation import not_none
 from rigidmd.units import BAR, BOLTZMANN
@@ -171,7 +171,7 @@ def acting_in(parts: SystemParts) -> Interactions:
 def interactions(parts: SystemParts) -> Interactions:
     """The interactions of the parts of a system. Raises SceneError."""
     scene, forces = parts.scene, parts.scene.forces
-    modules = {key: f"potentials.{key}" for key in POTENTIALS if getattr(forces, key) is not None}
+    modules = {"lennard_jones": "potentials.lennard_jones"}
     if any(m.charges.any() for m in parts.species):
         modules["charges"] = ELECTROSTATICS[not_none(forces.electrostatics)].module
     if forces.dispersion != "cutoff":
@@ -236,10 +236,9 @@ def left_out(
     direct = has_sums and forces.electrostatics == "ewald" and forces.dispersion != "pme"
     method = forces.electrostatics
     has_charges = any(trait(term, "acts_on_charges") for term in terms.values())
+    why = "no site has it" if forces.lennard_jones else "lennard_jones is false"
     reasons = {
-        f"{title}: {'no site has it' if getattr(forces, key) else without}": key not in terms
-        for key, (title, without) in POTENTIALS.items()
-    } | {
+        f"Lennard-Jones: {why}": "lennard_jones" not in terms,
         f"charges: {'electrostatics is none' if charged else 'no site has one'}": not has_charges,
         f"sums over periodic images, Fourier transforms: electrostatics is {method}": (
             has_charges and not has_sums

@@ -52,6 +52,8 @@ class Extra:
     python_forces: Mapping[str, Callable] = field(default_factory=dict)
     #: In place of the thermostat of every stage
     thermostat: "NamedTuple | ThermostatOfStages | None" = None
+    #: Name of a term in place of one of the core -> what it is, for messages
+    titles: Mapping[str, str] = field(default_factory=dict)
     #: Columns of the log
     columns: Mapping[str, Column] = field(default_factory=dict)
 

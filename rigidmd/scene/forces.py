@@ -61,10 +61,6 @@ ELECTROSTATICS = {
 }
 #: Defaults of `electrostatics` where sites have charges, in a periodic box and in an open one.
 PERIODIC, OPEN = "pme", "coulomb"
-#: Pair potentials that are not of charges: key of `Forces`, which also names the term and the
-#: module in `forces.potentials` with the function `interactions` -> its name among the unused
-#: interactions, and why.
-POTENTIALS = {"lennard_jones": ("Lennard-Jones", "lennard_jones is false")}
 
 
 class UnlikePair(Section):

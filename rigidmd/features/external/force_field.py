@@ -15,7 +15,6 @@ import numpy as np
 
 from rigidmd.engines.system import System
 from rigidmd.features.potentials.extra import body_pairs_of
-from rigidmd.features.potentials.sites.custom import CustomPotential
 from rigidmd.forces.ewald.corrections import Background, SurfaceDipole
 from rigidmd.forces.ewald.direct_sum import EwaldSum
 from rigidmd.forces.ewald.pme import Pme
@@ -167,6 +166,7 @@ def unknown_terms(
 
     body_pairs : see `external.Translations`
     """
+    titles = {name: x for extra in system.extras.values() for name, x in extra.titles.items()}
     for name, term in system.terms.items():
         if potential := body_pairs_of(system).get(name):
             if limits := body_pairs.get(type(potential.function)):
@@ -180,8 +180,7 @@ def unknown_terms(
             is_field = trait(term, "changes_momentum") is not None
             what = "a field" if is_field else f"the term {kind.__name__}"
             what = f"the pair potential {kind.__name__}" if isinstance(term, PairForces) else what
-            if kind is CustomPotential:
-                what = "the soft core of [coupling]"
+            what = titles.get(name, what)
             if kind is SurfaceDipole:
                 what = "forces.ewald_slab or ewald_surface_permittivity"
         if name in system.user_terms or kind not in DESCRIBED:

@@ -16,6 +16,7 @@ from rigidmd.scene.validation import not_none
 
 NAME = "free_energy"
 CHARGES_FROM = 0.5
+TITLES = {"soft_core": "the soft core of [coupling]"}
 
 
 def with_coupling(
@@ -98,7 +99,9 @@ def with_other_lambdas(system: System, parts: SystemParts) -> System:
         at[value] = acting_in(coupled(parts._replace(scene=scene)))
     columns = dict(map(lambda_column, at))
     system.notes.append(coupling.in_short)
-    return replace(system, extras=system.extras | {NAME: OtherLambdas(columns=columns, at=at)})
+    return replace(
+        system, extras=system.extras | {NAME: OtherLambdas(columns=columns, at=at, titles=TITLES)}
+    )
 
 
 def lambda_column(value: float) -> tuple[str, Column]:
