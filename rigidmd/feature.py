@@ -133,6 +133,10 @@ class Feature:
         """A warning at a state in a run, which is given once. Empty without one."""
         return ""
 
+    def axes(self, system: object) -> Iterator[tuple[str, str]]:
+        """(species, "x", "y" or "z") of axes of bodies, in the coordinates of the models' files."""
+        return iter(())
+
     def shapes(self, system: object) -> Iterator[tuple[str, list[tuple]]]:
         """(species, its ellipsoids) for species that are drawn with a shape. An ellipsoid has the
         index of its molecule, offset (3,) and frame (3, 3) in the body, semi-axes (3,) in Å and

@@ -31,7 +31,7 @@ FEATURES = (
     Row(
         "analysis",
         "analyses of runs",
-        needs=("potentials", "view"),
+        needs=("view",),
         commands=("analyse",),
         display="display",
         provides=("page_parts",),

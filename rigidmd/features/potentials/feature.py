@@ -66,6 +66,13 @@ class Potentials(Feature):
 
         return within_table(system, state)
 
+    def axes(self, system: System) -> Iterator[tuple[str, str]]:
+        from rigidmd.features.potentials.poses.bodies import bodies_of_potentials
+
+        for bodies in bodies_of_potentials(system):
+            if axis := bodies.potential.axis:
+                yield bodies.species.name, axis
+
     def shapes(self, system: System) -> Iterator[tuple[str, list[tuple]]]:
         from rigidmd.features.potentials.poses.shapes import shapes_of
 

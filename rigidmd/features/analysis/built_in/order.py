@@ -5,6 +5,7 @@ from typing import Literal
 import numpy as np
 
 from rigidmd.errors import OutputError
+from rigidmd.features import acting_on
 from rigidmd.features.analysis.registry import built_in
 from rigidmd.features.analysis.result import (
     AnalysisResult,
@@ -16,7 +17,6 @@ from rigidmd.features.analysis.result import (
 )
 from rigidmd.features.analysis.rigid_frames import RigidFrames
 from rigidmd.features.analysis.runs import Runs
-from rigidmd.features.potentials.poses.bodies import bodies_of_potentials
 from rigidmd.run.rigid_fit import Kind
 
 #: Mean S of N molecules without order, times the square root of N, for large N: Q has five
@@ -88,14 +88,15 @@ def nematic(runs: Runs, axis: Literal["", "x", "y", "z"] = "") -> AnalysisResult
 def _axis_body(runs: Runs, kind: Kind, axis: str) -> np.ndarray | None:
     """The axis of a species in its body frame; None without one."""
     molecule = kind.molecule
-    of_potentials = [
-        bodies.potential.axis
-        for bodies in bodies_of_potentials(runs.system)
-        if bodies.species.name == molecule.name and bodies.potential.axis
+    of_features = [
+        name
+        for feature in acting_on(runs.system.scene)
+        for species, name in feature.axes(runs.system)
+        if species == molecule.name
     ]
     if molecule.kind == "linear":
         return np.eye(3)[0]
-    if not molecule.inertia.any() or not (named := [axis] if axis else of_potentials):
+    if not molecule.inertia.any() or not (named := [axis] if axis else of_features):
         return None
     return molecule.axes["xyz".index(named[0])]
 
