@@ -97,8 +97,8 @@ class Engine(Protocol):
 
     @property
     def trajectories(self) -> np.ndarray | None:
-        """Sums (5,) over the trajectories of hybrid Monte Carlo so far, see
-        `dynamics.hybrid_monte_carlo`."""
+        """Sums (5,) over the trajectories so far that were accepted or rejected, see
+        `features.monte_carlo.trajectories`."""
 
     @property
     def chosen_steps(self) -> tuple[int, int] | None:
