@@ -24,8 +24,8 @@ def new_registers() -> Registers:
 
 
 class Timing(NamedTuple):
-    """The time over which a row acts, and its random numbers."""
+    """When a row acts, over which time, and its random numbers."""
 
     fraction: float  # of the time step
     draw: int  # its first random number
-    dt: np.ndarray  # (1,) of the registers
+    when: int  # bits of `Pass.when`

@@ -90,21 +90,21 @@ class Advance:
     """`advance` of molecules, for Python: bound to all that it works on. At the end it also sums
     over the state and its load, while these are in the caches of the cores.
 
-    parts : without `code` and `recovery`, which are made here
+    parts : without the code of the thermostat and recovery, which are made here
     """
 
     def __init__(self, scheme: Scheme, parts: StepParts):
-        self._recovery = bound_program(extension_of(scheme).after_failure(parts), parts.status)
-        parts = parts._replace(
-            code=thermostat_code(scheme.thermostat, parts.model), recovery=self._recovery.rows
-        )
+        recovery = extension_of(scheme).after_failure(parts)
+        self._recovery = bound_program(recovery, parts.core.status)
+        core = parts.core._replace(recovery=self._recovery.rows)
+        parts = parts._replace(core=core, code=thermostat_code(scheme.thermostat, core.model))
         table = StepTable(scheme, parts)
-        self._program = bound_program(table.passes, parts.status)
+        self._program = bound_program(table.passes, core.status)
         self._parts, self._call = parts, np.zeros(4, np.int64)
         self._extent, self._sums = np.zeros(len(LargestValues._fields)), np.zeros(SUM_COUNT)
-        steps = self._program.rows, table.intervals, parts.registers.row, self._call
+        steps = self._program.rows, table.intervals, core.registers.row, self._call
         self._task = BoundTask(
-            _advance, (parts.model, parts.state, parts.load, steps, self._extent, self._sums)
+            _advance, (core.model, core.state, core.load, steps, self._extent, self._sums)
         )
 
     def begin(self, dt: float, until: int, observed: bool, is_current: bool) -> None:
@@ -112,8 +112,8 @@ class Advance:
 
         is_current : whether the load belongs to the current positions
         """
-        self._call[:] = self._parts.state.step[NOW], until, observed, OK
-        registers, terms = self._parts.registers, self._parts.terms
+        _, state, _, registers, _, terms, _ = self._parts.core
+        self._call[:] = state.step[NOW], until, observed, OK
         registers.dt[0], registers.row[0] = dt, 0
         known = int(registers.known[0]) | FORCES_ONLY if is_current else 0
         if terms is not None and not terms.tallies_valid[0]:
@@ -133,7 +133,7 @@ class Advance:
     @property
     def loaded(self) -> bool:
         """Whether the load belongs to the current positions."""
-        return bool(self._parts.registers.known[0])
+        return bool(self._parts.core.registers.known[0])
 
     @property
     def extent(self) -> LargestValues:

@@ -18,26 +18,29 @@ from rigidmd.forces.terms import TermTable
 EVERY, LAST, FIRST, REPEATED, PLAIN, ENERGIES, INTERVAL = (1 << n for n in range(7))
 
 
-class StepParts(NamedTuple):
-    """What the rows of a step of molecules read and write. Where a step is only printed, `code`,
-    `terms` and `recovery` are None."""
+class StepCore(NamedTuple):
+    """What all rows of a step of molecules read and write. A step that is only printed has no terms
+    and no recovery."""
 
     model: Model
     state: State
     load: Load
     registers: Registers
     status: np.ndarray  # (1,) int64, into which rows write status codes
-    heat: np.ndarray  # see `thermostat_workspace`
-    has_rates: bool  # whether there are time-dependent terms
-    barostat: tuple | None = None  # workspace of the barostat
-    gradient: GradientWorkspace | None = None
-    extension: tuple | None = None  # workspace of the extension
-    code: Code | None = None  # see `thermostat_code`
-    terms: TermTable | None = None  # bound to the state and the load
+    terms: TermTable | None  # bound to the state and the load
     recovery: Rows | None = None  # rows after forces that failed
 
-    def timing(self, fraction: float, draw: int) -> Timing:
-        return Timing(fraction, draw, self.registers.dt)
+
+class StepParts(NamedTuple):
+    """What the rows of a step of molecules are made from."""
+
+    core: StepCore
+    heat: np.ndarray  # see `thermostat_workspace`
+    has_rates: bool  # whether there are time-dependent terms
+    barostat: tuple | None  # its workspace
+    gradient: GradientWorkspace | None
+    extension: tuple | None  # its workspace
+    code: Code | None = None  # see `thermostat_code`; None where a step is only printed
 
 
 #: Workspace of an extension, a NamedTuple.
@@ -52,22 +55,22 @@ class StepExtension(Generic[Workspace]):
         """A new workspace."""
         raise NotImplementedError
 
-    def begin(self, parts: StepParts, timing: Timing, when: int) -> list[Pass]:
+    def begin(self, parts: StepParts, timing: Timing) -> list[Pass]:
         """Rows before the first of some steps. Forces are known there, and energies, or the row has
         kept what it needs of them (KEPT_BY_EXTENSION)."""
         return []
 
-    def end(self, parts: StepParts, timing: Timing, when: int) -> list[Pass]:
+    def end(self, parts: StepParts, timing: Timing) -> list[Pass]:
         """Rows after the last of these steps. Forces, energies and virials are known there."""
         return []
 
-    def after_barostat(self, parts: StepParts, when: int) -> list[Pass]:
+    def after_barostat(self, parts: StepParts, timing: Timing) -> list[Pass]:
         """Rows after a move of the box."""
         return []
 
     def after_failure(self, parts: StepParts) -> list[Pass]:
-        """Rows after forces that failed; the code is in `parts.status`. If they write OK there, the
-        forces are computed once more."""
+        """Rows after forces that failed; the code is in `status` of the core. If they write OK
+        there, the forces are computed once more."""
         return []
 
     def forget(self, workspace: Workspace) -> None:

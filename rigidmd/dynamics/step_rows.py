@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from rigidmd.compile import Pass, Rows, call_row, implements, kernel, load_arguments, task
+from rigidmd.compile import Pass, call_row, implements, kernel, load_arguments, task
 from rigidmd.core.integrators import Flow
 from rigidmd.core.state import NOW, OK, ORIGIN, REMOVED, WORK
 from rigidmd.dynamics.force_gradient import add_gyration, displace, evaluate
@@ -47,69 +47,51 @@ def forces_row(parts: StepParts, which: int, when: int, enough: int = 0) -> Pass
     enough : bits of `Registers.known` that make it needless, in addition to `which`
     """
     known, text = COMPUTED[which]
-    content = (
-        parts.terms,
-        parts.state,
-        parts.load,
-        parts.registers,
-        Evaluation(which, which | enough, known),
-        parts.recovery,
-        parts.status,
-    )
+    content = parts.core, Evaluation(which, which | enough, known)
     return Pass(text, _compute_forces, content, when=when)
 
 
 @task()
 def _compute_forces(arguments, block):
-    terms, state, load, registers, row, recovery, status = load_arguments(arguments)
-    if registers.known[0] & row.enough != 0:
+    core, row = load_arguments(arguments)
+    known, status = core.registers.known, core.status
+    if known[0] & row.enough != 0:
         return
-    registers.known[0] = 0
-    status[0] = compute_load(terms, state, load, row.which)
-    if status[0] != OK and is_recovered(recovery, status):
-        status[0] = compute_load(terms, state, load, row.which)
+    known[0] = 0
+    status[0] = compute_load(core.terms, core.state, core.load, row.which)
+    if status[0] != OK and is_recovered(core):
+        status[0] = compute_load(core.terms, core.state, core.load, row.which)
     if status[0] == OK:
-        registers.known[0] = row.known
+        known[0] = row.known
 
 
 @kernel
-def is_recovered(recovery: Rows, status):
+def is_recovered(core):
     """Run the rows after forces that failed. Returns whether the failure is none of the run."""
-    for k in range(len(recovery.address)):
-        call_row(recovery, recovery.arguments, k)
-    return status[0] == OK
+    for k in range(len(core.recovery.address)):
+        call_row(core.recovery, core.recovery.arguments, k)
+    return core.status[0] == OK
 
 
 def gradient_row(parts: StepParts, flow: Flow) -> Pass:
     """Forces with their gradient for a kick, unless they are known."""
-    content = (
-        parts.model,
-        parts.terms,
-        parts.state,
-        parts.load,
-        parts.gradient,
-        parts.registers,
-        flow.gradient,
-        parts.recovery,
-        parts.status,
-    )
+    content = parts.core, parts.gradient, flow.gradient
     text = f"gradient of the forces, {flow.gradient:.4g} dt²"
     return Pass(text, _compute_gradient, content, when=EVERY)
 
 
 @task()
 def _compute_gradient(arguments, block):
-    model, terms, state, load, gradient, registers, fraction, recovery, status = load_arguments(
-        arguments
-    )
-    tau = fraction * registers.dt[0] * registers.dt[0]
-    if registers.known[0] & INTO_OTHER_LOAD != 0 and gradient.tau[0] == tau:
+    core, gradient, fraction = load_arguments(arguments)
+    dt, known, status = core.registers.dt[0], core.registers.known, core.status
+    tau = fraction * dt * dt
+    if known[0] & INTO_OTHER_LOAD != 0 and gradient.tau[0] == tau:
         return
-    status[0] = evaluate(model, state, load, terms, gradient, tau, known=True)
+    status[0] = evaluate(core.model, core.state, core.load, core.terms, gradient, tau, known=True)
     if status[0] == OK:
-        registers.known[0] |= INTO_OTHER_LOAD
+        known[0] |= INTO_OTHER_LOAD
     else:
-        is_recovered(recovery, status)
+        is_recovered(core)
 
 
 class Move(NamedTuple):
@@ -132,20 +114,20 @@ def move_row(
     fractions = [flow.fraction for flow in kicks]
     first, second, *_ = (*fractions, 0.0, 0.0)
     has_gradient = any(flow.gradient for flow in kicks)
-    load = parts.gradient.load if has_gradient and parts.gradient is not None else parts.load
+    load = parts.gradient.load if has_gradient and parts.gradient is not None else parts.core.load
     move = Move((first, second), 0.0 if drift is None else drift.fraction, moment)
     texts = [f"kick {flow.fraction:.4g} dt" for flow in kicks]
     texts += [] if drift is None else [f"drift {drift.fraction:.4g} dt"]
-    blocks = blocks_of(len(parts.state.position))
-    content = parts.model, parts.state, load, parts.registers, move
-    return Pass(", ".join(texts), _move, content, blocks, when)
+    blocks = blocks_of(len(parts.core.state.position))
+    return Pass(", ".join(texts), _move, (parts.core, load, move), blocks, when)
 
 
 @task()
 def _move(arguments, block):
     """Kicks: V += h F/m, L += h n_body, the exact flow of the potential. Then, if there is a drift,
     free flight and free rotation."""
-    model, state, load, registers, move = load_arguments(arguments)
+    core, load, move = load_arguments(arguments)
+    model, state, registers = core.model, core.state, core.registers
     if block == 0 and move.drift != 0.0:
         steps = state.step[NOW] - state.step[ORIGIN] + move.moment
         state.time[NOW] = state.time[ORIGIN] + steps * registers.dt[0]
@@ -175,7 +157,8 @@ def _move(arguments, block):
 
 def orthogonality_row(parts: StepParts, when: int) -> Pass:
     """Correct the rounding errors of QᵀQ."""
-    return Pass("orthogonality of rotations", _restore_orthogonality, (parts.state,), when=when)
+    content = (parts.core.state,)
+    return Pass("orthogonality of rotations", _restore_orthogonality, content, when=when)
 
 
 @task()
@@ -186,22 +169,22 @@ def _restore_orthogonality(arguments, block):
 
 def work_row(parts: StepParts, flow: Flow) -> Pass:
     """The work of time-dependent terms during a kick."""
-    content = parts.terms, parts.state, parts.registers, flow.fraction
+    content = parts.core, flow.fraction
     return Pass("work of time-dependent fields", _add_work, content, when=EVERY)
 
 
 @task()
 def _add_work(arguments, block):
-    terms, state, registers, fraction = load_arguments(arguments)
-    h = 0.0 if registers.resting[0] != 0 else fraction * registers.dt[0]
-    work = 0.5 * h * total_energy_rate(terms)  # before the kick and after it
-    state.energy_ledger[WORK] += work
-    state.energy_ledger[WORK] += work
+    core, fraction = load_arguments(arguments)
+    h = 0.0 if core.registers.resting[0] != 0 else fraction * core.registers.dt[0]
+    work = 0.5 * h * total_energy_rate(core.terms)  # before the kick and after it
+    core.state.energy_ledger[WORK] += work
+    core.state.energy_ledger[WORK] += work
 
 
 def removal_row(parts: StepParts, when: int) -> Pass:
     """Remove the conserved components of the total momentum."""
-    content = parts.model, parts.state
+    content = parts.core.model, parts.core.state
     return Pass("removal of the total momentum", _remove_momentum, content, when=when)
 
 

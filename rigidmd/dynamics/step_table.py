@@ -22,7 +22,7 @@ from rigidmd.core.integrators import (
     Flow,
     Scheme,
 )
-from rigidmd.dynamics.registers import KEPT_BY_BAROSTAT, KEPT_BY_EXTENSION
+from rigidmd.dynamics.registers import KEPT_BY_BAROSTAT, KEPT_BY_EXTENSION, Timing
 from rigidmd.dynamics.step_parts import (
     ENERGIES,
     EVERY,
@@ -87,7 +87,8 @@ class StepTable:
         rows: list[Pass] = []
         for group in groups:
             k, flow = group[0]
-            when, timing = self._when(flow), parts.timing(flow.fraction, DRAWS * k)
+            when = self._when(flow)
+            timing = Timing(flow.fraction, DRAWS * k, when)
             if flow.kind in (KICK, DRIFT):
                 rows += self._forces_of_kicks(group)
                 if group is opening:
@@ -96,20 +97,20 @@ class StepTable:
                     rows.append(self._move(group, LAST if group is closing else EVERY))
                 rows += self._after_drift(group)
             elif flow.kind == THERMOSTAT:
-                rows.append(thermostat_row(scheme.thermostat, parts, timing, when))
+                rows.append(thermostat_row(scheme.thermostat, parts, timing))
             elif flow.kind == BAROSTAT:
                 rows += self._forces_of_barostat(k, when)
-                rows += scheme.barostat.rows(parts, timing, when)
-                rows += self._extension.after_barostat(parts, when)
+                rows += scheme.barostat.rows(parts, timing)
+                rows += self._extension.after_barostat(parts, timing)
             elif flow.kind == SCALE_BOX:
                 rows.append(scheme.barostat.volume_row(parts, timing))
                 self._has_forces = self._has_energies = False
             elif flow.kind == BEGIN:
                 rows.append(forces_row(parts, WITH_ENERGIES, when, KEPT_BY_EXTENSION))
-                rows += self._extension.begin(parts, timing, when)
+                rows += self._extension.begin(parts, timing)
             elif flow.kind == END:
                 rows += self._energies(when, 0)
-                rows += self._extension.end(parts, timing, when)
+                rows += self._extension.end(parts, timing)
                 self._has_energies = False
             elif flow.kind == REMOVE_MOMENTUM:
                 rows.append(removal_row(parts, when))
@@ -190,7 +191,7 @@ class StepTable:
         if flow.kind != DRIFT:
             return []
         self._has_forces = self._has_energies = False
-        if k != self._drifts[-1] or not len(self._parts.state.rotation):
+        if k != self._drifts[-1] or not len(self._parts.core.state.rotation):
             return []
         every = ORTHOGONALITY_INTERVAL
         return [

@@ -96,9 +96,9 @@ class Engine(Protocol):
         """Moves of the box, tried and accepted so far."""
 
     @property
-    def trajectories(self) -> np.ndarray | None:
-        """Sums (5,) over the trajectories so far that were accepted or rejected, see
-        `features.monte_carlo.trajectories`."""
+    def extension_sums(self) -> np.ndarray | None:
+        """What the extension of the step has counted and summed so far, see
+        `dynamics.step_parts.StepExtension`."""
 
     @property
     def chosen_steps(self) -> tuple[int, int] | None:

@@ -459,7 +459,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         # an external engine may not report the heat of its thermostat
         conserves = not stage.is_minimisation and self.engine.conserves_energy
         trajectories = tuple(nan for name in self.system.more_columns if name in OF_FEATURES)
-        if (sums := self.engine.trajectories) is not None:
+        if (sums := self.engine.extension_sums) is not None:
             samples = self._sampler.samples
             of_stage = len(samples) > 0 and samples.row(-1).stage == moment.stage
             ended, accepted, sizes, _, weights = (

@@ -97,7 +97,7 @@ class Sampler(Observer):
         self.last_good: State | None = None
         self._run, self._check = run, check
         self._warns = acting_on(run.scene)  # each once
-        self.trajectories = np.zeros(5)  # see `Engine.trajectories`, at the last sample
+        self.trajectories = np.zeros(5)  # see `Engine.extension_sums`, at the last sample
         if any(stage.in_trajectories for stage in run.scene.stages):
             self.remembers = self.remembers | {"trajectories": np.ndarray}
         # stage -> row of the last sample before it, or of the first
@@ -114,7 +114,7 @@ class Sampler(Observer):
         run, now, samples = self._run, moment.sample, self.samples
         since = self._begins.setdefault(now.stage, max(0, len(samples) - 1))
         samples.append(now)
-        if (trajectories := run._part.engine.trajectories) is not None:
+        if (trajectories := run._part.engine.extension_sums) is not None:
             self.trajectories = trajectories
         stage = run.scene.stages[now.stage]
         if stage.has_thermostat:

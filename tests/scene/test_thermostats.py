@@ -113,8 +113,8 @@ class Swelling(NamedTuple):
 
     forces = FORCES_ONLY
 
-    def rows(self, parts, timing, when):
-        return barostats.rows_of_moves(self, parts, timing, when)
+    def rows(self, parts, timing):
+        return barostats.rows_of_moves(self, parts, timing)
 
 
 @implements(barostats.propose_strain, Swelling)

@@ -97,36 +97,28 @@ class Barostat(Protocol):
         """What each evaluation of forces computes: FORCES_ONLY or WITH_VIRIALS."""
         ...
 
-    def rows(self, parts: StepParts, timing: Timing, when: int) -> list[Pass]:
+    def rows(self, parts: StepParts, timing: Timing) -> list[Pass]:
         """Its flow in a step. What `forces` computes is known before it, and energies and virials
         where this is FORCES_ONLY."""
         ...
 
 
 @kernel(inline=True)
-def keep_tally(terms, workspace, registers):
+def keep_tally(core, workspace):
     """Sum energies and virials of the current positions into tally[0], unless they are there."""
-    if registers.known[0] & KEPT_BY_BAROSTAT == 0:
+    known = core.registers.known
+    if known[0] & KEPT_BY_BAROSTAT == 0:
         for k in range(TALLY_SIZE):
             workspace.tally[0, k] = 0.0
-            for tally in terms.tallies:
+            for tally in core.terms.tallies:
                 workspace.tally[0, k] += tally[k]
-        registers.known[0] |= KEPT_BY_BAROSTAT
+        known[0] |= KEPT_BY_BAROSTAT
 
 
-def rows_of_moves(barostat: NamedTuple, parts: StepParts, timing: Timing, when: int) -> list[Pass]:
+def rows_of_moves(barostat: NamedTuple, parts: StepParts, timing: Timing) -> list[Pass]:
     """Trial moves, by `propose_strain` and `rescale_velocities`, and their Metropolis test with
     `log_acceptance`."""
-    content = (
-        barostat,
-        parts.model,
-        parts.terms,
-        parts.state,
-        parts.load,
-        parts.barostat,
-        parts.registers,
-        timing,
-    )
+    content, when = (barostat, parts.core, parts.barostat, timing), timing.when
     name = f"barostat {type(barostat).__name__} {timing.fraction:.4g} dt"
     return [
         Pass(f"{name}: trial move of the box", _try_move, content, when=when),
@@ -138,9 +130,10 @@ def rows_of_moves(barostat: NamedTuple, parts: StepParts, timing: Timing, when: 
 @task()
 def _try_move(arguments, block):
     """Keep the state, and make a trial move of the box if it is possible."""
-    barostat, model, terms, state, load, workspace, registers, timing = load_arguments(arguments)
-    keep_tally(terms, workspace, registers)
-    h = timing.fraction * timing.dt[0]
+    barostat, core, workspace, timing = load_arguments(arguments)
+    model, state, load, registers = core.model, core.state, core.load, core.registers
+    keep_tally(core, workspace)
+    h = timing.fraction * registers.dt[0]
     workspace.is_moved[0] = propose_strain(barostat, model, state, workspace, h, timing.draw)
     if workspace.is_moved[0] != 0:
         copy_moved(state, load, workspace, workspace.load, workspace.tally[0], workspace.tally[1])
@@ -151,19 +144,20 @@ def _try_move(arguments, block):
 @task()
 def _test_move(arguments, block):
     """Accept a trial move, or return to the state before it."""
-    barostat, model, terms, state, load, workspace, registers, timing = load_arguments(arguments)
+    barostat, core, workspace, timing = load_arguments(arguments)
+    model, state, load, registers = core.model, core.state, core.load, core.registers
     workspace.counts[0] += 1
     if workspace.is_moved[0] == 0:
         return
-    keep_tally(terms, workspace, registers)
-    chance = log_acceptance(barostat, model, state, workspace, timing.fraction * timing.dt[0])
+    keep_tally(core, workspace)
+    chance = log_acceptance(barostat, model, state, workspace, timing.fraction * registers.dt[0])
     u, _ = uniforms(barostat.key, timing.draw + 8, 0, state.step[NOW])
     if log(u) < chance:
         workspace.counts[1] += 1
         state.energy_ledger[WORK] += energy_gained(barostat, model, state, workspace)
     else:
         copy_moved(workspace, workspace.load, state, load, workspace.tally[1], workspace.tally[0])
-        terms.tallies_valid[0] = 0
+        core.terms.tallies_valid[0] = 0
         registers.known[0] = FORCES_ONLY | KEPT_BY_BAROSTAT
 
 

@@ -47,8 +47,8 @@ class CellRescaling(NamedTuple):
 
     forces = FORCES_ONLY
 
-    def rows(self, parts: StepParts, timing: Timing, when: int) -> list[Pass]:
-        return rows_of_moves(self, parts, timing, when)
+    def rows(self, parts: StepParts, timing: Timing) -> list[Pass]:
+        return rows_of_moves(self, parts, timing)
 
 
 def barostat(stage: Stage, confinement: Confinement) -> CellRescaling:

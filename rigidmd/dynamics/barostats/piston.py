@@ -9,7 +9,7 @@ from rigidmd.compile import Pass, kernel, load_arguments, task
 from rigidmd.core.state import WORK
 from rigidmd.dynamics.barostats import Confinement, Pressure, keep_tally, target_pressure
 from rigidmd.dynamics.registers import Timing
-from rigidmd.dynamics.step_parts import EVERY, StepParts
+from rigidmd.dynamics.step_parts import StepParts
 from rigidmd.dynamics.thermostats import scale_array, translational_energy
 from rigidmd.forces.neighbors.space import volume_of
 from rigidmd.forces.terms import WITH_VIRIALS
@@ -35,24 +35,16 @@ class Piston(NamedTuple):
     variables = 1  # how many numbers it has in `state.extra_variables`
     forces = WITH_VIRIALS
 
-    def rows(self, parts: StepParts, timing: Timing, when: int) -> list[Pass]:
-        content = (
-            self,
-            parts.model,
-            parts.terms,
-            parts.state,
-            parts.barostat,
-            parts.registers,
-            timing,
-        )
+    def rows(self, parts: StepParts, timing: Timing) -> list[Pass]:
+        content = self, parts.core, parts.barostat, timing
         text = f"barostat Piston {timing.fraction:.4g} dt: kick of the volume"
-        return [Pass(text, _kick_piston, content, when=when)]
+        return [Pass(text, _kick_piston, content, when=timing.when)]
 
     def volume_row(self, parts: StepParts, timing: Timing) -> Pass:
         """The change of the volume by its inertia."""
-        content = self, parts.state, parts.registers, timing
+        content = self, parts.core, timing
         text = f"drift of the volume {timing.fraction:.4g} dt"
-        return Pass(text, _move_piston, content, when=EVERY)
+        return Pass(text, _move_piston, content, when=timing.when)
 
 
 def barostat(stage: Stage, confinement: Confinement) -> Piston:
@@ -67,12 +59,13 @@ def barostat(stage: Stage, confinement: Confinement) -> Piston:
 
 @task()
 def _kick_piston(arguments, block):
-    barostat, model, terms, state, workspace, registers, timing = load_arguments(arguments)
-    keep_tally(terms, workspace, registers)
-    h = timing.fraction * timing.dt[0]
+    barostat, core, workspace, timing = load_arguments(arguments)
+    state = core.state
+    keep_tally(core, workspace)
+    h = timing.fraction * core.registers.dt[0]
     volume = volume_of(state.cell)
     virial = workspace.tally[0, 1] + workspace.tally[0, 5] + workspace.tally[0, 9]
-    momenta = 2 * barostat.exponent * translational_energy(model, state)
+    momenta = 2 * barostat.exponent * translational_energy(core.model, state)
     pressure = (momenta + virial) / (3 * volume) + barostat.tail[1] / volume**2
     before = state.extra_variables[-1]
     state.extra_variables[-1] += h * (pressure - target_pressure(barostat.pressure, state, 0))
@@ -95,6 +88,6 @@ def move_piston(barostat, state, h):
 
 @task()
 def _move_piston(arguments, block):
-    barostat, state, registers, timing = load_arguments(arguments)
-    move_piston(barostat, state, timing.fraction * timing.dt[0])
-    registers.known[0] = 0
+    barostat, core, timing = load_arguments(arguments)
+    move_piston(barostat, core.state, timing.fraction * core.registers.dt[0])
+    core.registers.known[0] = 0

@@ -113,16 +113,16 @@ def apply_thermostat(thermostat, model, code, state, workspace, h, draw):
 
 @task()
 def _apply_thermostat(arguments, block):
-    thermostat, model, code, state, workspace, timing = load_arguments(arguments)
-    h = timing.fraction * timing.dt[0]
-    apply_thermostat(thermostat, model, code, state, workspace, h, timing.draw)
+    thermostat, core, code, workspace, timing = load_arguments(arguments)
+    h = timing.fraction * core.registers.dt[0]
+    apply_thermostat(thermostat, core.model, code, core.state, workspace, h, timing.draw)
 
 
-def thermostat_row(thermostat: NamedTuple, parts: StepParts, timing: Timing, when: int) -> Pass:
+def thermostat_row(thermostat: NamedTuple, parts: StepParts, timing: Timing) -> Pass:
     """`apply_thermostat` in a step."""
-    content = thermostat, parts.model, parts.code, parts.state, parts.heat, timing
+    content = thermostat, parts.core, parts.code, parts.heat, timing
     text = f"thermostat {type(thermostat).__name__} {timing.fraction:.4g} dt"
-    return Pass(text, _apply_thermostat, content, when=when)
+    return Pass(text, _apply_thermostat, content, when=timing.when)
 
 
 def apply_by_molecule(thermostat, model, code, state, workspace, h, draw):

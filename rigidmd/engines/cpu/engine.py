@@ -16,13 +16,13 @@ from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.observables import LargestValues, StateSums
 from rigidmd.dynamics.registers import KEPT_BY_BAROSTAT, KEPT_BY_EXTENSION, new_registers
 from rigidmd.dynamics.step_loop import Advance
-from rigidmd.dynamics.step_parts import StepExtension, StepParts, extension_of
+from rigidmd.dynamics.step_parts import StepCore, StepExtension, StepParts, extension_of
 from rigidmd.dynamics.thermostats import thermostat_workspace
 from rigidmd.engines.cpu.compiled import CompiledEngine, Steps
 from rigidmd.engines.protocol import Tally
 from rigidmd.errors import SimulationError
 from rigidmd.forces.fields.walls import LennardJonesWalls
-from rigidmd.forces.terms import Setup, TermDispatcher, trait
+from rigidmd.forces.terms import Setup, TermDispatcher, TermTable, trait
 
 __all__ = ["BehindWallError", "CompileError", "CpuEngine", "Precision"]
 
@@ -68,8 +68,7 @@ class CpuEngine(CompiledEngine[Model, Advance]):
         self, state: State, load: Load, integrator: Scheme, workspaces: tuple, step: Steps
     ) -> bool:
         def new_advance(dispatcher: TermDispatcher) -> Advance:
-            parts = self.step_parts(integrator, state, load)
-            return Advance(integrator, parts._replace(terms=dispatcher.table))
+            return Advance(integrator, self.step_parts(integrator, state, load, dispatcher.table))
 
         if "steps" not in self._dispatchers:
             self._compile(lambda: new_advance(self._new_dispatcher("steps", workspaces)))
@@ -84,8 +83,10 @@ class CpuEngine(CompiledEngine[Model, Advance]):
             dispatcher.bind(workspaces, state, load, advance.other_load)
         return advance.loaded
 
-    def step_parts(self, scheme: Scheme, state: State, load: Load) -> StepParts:
-        """What the rows of a scheme read and write, without the terms."""
+    def step_parts(
+        self, scheme: Scheme, state: State, load: Load, terms: TermTable | None = None
+    ) -> StepParts:
+        """What the rows of a scheme are made from."""
         if scheme.barostat is not None:
             self._barostat = self._barostat or barostat_workspace(state)
         extension = None
@@ -97,11 +98,9 @@ class CpuEngine(CompiledEngine[Model, Advance]):
             if self._extension is not None:
                 self._extension[0].forget(self._extension[1])
         return StepParts(
-            model=self.model_for(scheme),
-            state=state,
-            load=load,
-            registers=self._registers,
-            status=np.zeros(1, np.int64),
+            core=StepCore(
+                self.model_for(scheme), state, load, self._registers, np.zeros(1, np.int64), terms
+            ),
             heat=self._heat,
             has_rates=any(trait(term, "time_dependent") for term in self.terms.values()),
             barostat=None if scheme.barostat is None else self._barostat,
@@ -189,7 +188,7 @@ class CpuEngine(CompiledEngine[Model, Advance]):
         return int(box.counts[0]), int(box.counts[1])
 
     @property
-    def trajectories(self) -> np.ndarray | None:
+    def extension_sums(self) -> np.ndarray | None:
         if self._extension is None:
             return None
         extension, workspace = self._extension

@@ -87,5 +87,5 @@ def _acceptance(system: System, state: State, k: int, stage: Stage) -> tuple[Sta
         engine.advance(now, scheme, stage.step, until)
     except SimulationError:  # a molecule was lost in a step that is too long
         return state, 0.0
-    sums = not_none(engine.trajectories)
+    sums = not_none(engine.extension_sums)
     return now, float(sums[CHANCES] / sums[ENDED])

@@ -69,40 +69,29 @@ class Trajectories(StepExtension[TrajectoryWorkspace]):
     def workspace(self, state: State) -> TrajectoryWorkspace:
         return trajectory_workspace(state)
 
-    def begin(self, parts: StepParts, timing: Timing, when: int) -> list[Pass]:
-        content = (
-            parts.model,
-            parts.code,
-            parts.terms,
-            parts.state,
-            parts.load,
-            parts.heat,
-            parts.extension,
-            parts.registers,
-        )
-        return [Pass("start of a trajectory", _start, content, when=when)]
+    def begin(self, parts: StepParts, timing: Timing) -> list[Pass]:
+        content = parts.core, parts.code, parts.heat, parts.extension
+        return [Pass("start of a trajectory", _start, content, when=timing.when)]
 
-    def end(self, parts: StepParts, timing: Timing, when: int) -> list[Pass]:
+    def end(self, parts: StepParts, timing: Timing) -> list[Pass]:
         content = (
             self.thermostat,
-            parts.model,
+            parts.core,
             parts.code,
-            parts.terms,
-            parts.state,
-            parts.load,
             parts.heat,
             parts.extension,
-            parts.registers,
             timing,
         )
-        return [Pass("accept the trajectory, or return to its start", _test, content, when=when)]
+        text = "accept the trajectory, or return to its start"
+        return [Pass(text, _test, content, when=timing.when)]
 
-    def after_barostat(self, parts: StepParts, when: int) -> list[Pass]:
-        content = parts.extension, parts.barostat, parts.registers
-        return [Pass("potential energy in the box", _know_potential, content, when=when)]
+    def after_barostat(self, parts: StepParts, timing: Timing) -> list[Pass]:
+        content = parts.extension, parts.barostat, parts.core.registers
+        return [Pass("potential energy in the box", _know_potential, content, when=timing.when)]
 
     def after_failure(self, parts: StepParts) -> list[Pass]:
-        content = parts.extension, parts.state, parts.load, parts.registers, parts.status
+        _, state, load, registers, status, *_ = parts.core
+        content = parts.extension, state, load, registers, status
         return [Pass("rest at the start of the trajectory", _rest, content)]
 
     def forget(self, workspace: TrajectoryWorkspace) -> None:
@@ -126,10 +115,11 @@ class Trajectories(StepExtension[TrajectoryWorkspace]):
 @task()
 def _start(arguments, block):
     """Keep the current state as the start of a trajectory."""
-    model, code, terms, state, load, blocks, workspace, registers = load_arguments(arguments)
-    if registers.known[0] & KEPT_BY_EXTENSION == 0:
-        workspace.energies[0] = potential_energy(terms)
-    moving, turning = kinetic_energies_of(model, code, state, blocks)
+    core, code, blocks, workspace = load_arguments(arguments)
+    state, load, known = core.state, core.load, core.registers.known
+    if known[0] & KEPT_BY_EXTENSION == 0:
+        workspace.energies[0] = potential_energy(core.terms)
+    moving, turning = kinetic_energies_of(core.model, code, state, blocks)
     workspace.energies[1] = moving + turning
     copy_start(state, load, workspace, workspace.load)
     workspace.is_under_way[0] = 1
@@ -138,14 +128,13 @@ def _start(arguments, block):
 @task()
 def _test(arguments, block):
     """Accept the current state as the end of a trajectory, or return to its start."""
-    thermostat, model, code, terms, state, load, blocks, workspace, registers, timing = (
-        load_arguments(arguments)
-    )
-    potential = potential_energy(terms)
-    moving, turning = kinetic_energies_of(model, code, state, blocks)
+    thermostat, core, code, blocks, workspace, timing = load_arguments(arguments)
+    state, load, known = core.state, core.load, core.registers.known
+    potential = potential_energy(core.terms)
+    moving, turning = kinetic_energies_of(core.model, code, state, blocks)
     gained = potential - workspace.energies[0] + (moving + turning - workspace.energies[1])
     loss = gained / ramp_value(thermostat.thermal_energy, state)
-    if isnan(loss) or registers.resting[0] != 0:
+    if isnan(loss) or core.registers.resting[0] != 0:
         loss = inf
     u, _ = uniforms(thermostat.key, timing.draw, 0, state.step[NOW])
     sums = workspace.sums
@@ -153,7 +142,7 @@ def _test(arguments, block):
     sums[SIZES] += min(LARGEST, abs(loss))
     sums[CHANCES] += exp(min(0.0, -loss))
     sums[WEIGHTS] += exp(min(LARGEST, -loss))
-    workspace.known[0], workspace.is_under_way[0], registers.resting[0] = 1, 0, 0
+    workspace.known[0], workspace.is_under_way[0], core.registers.resting[0] = 1, 0, 0
     if log(u) < -loss:
         sums[ACCEPTED] += 1
         workspace.energies[0] = potential
@@ -162,9 +151,9 @@ def _test(arguments, block):
         copy_start(workspace, workspace.load, state, load)
         negate(state.velocity)
         negate(state.angular_momentum_body)
-        terms.tallies_valid[0] = 0
-        registers.known[0] = FORCES_ONLY
-    registers.known[0] |= KEPT_BY_EXTENSION
+        core.terms.tallies_valid[0] = 0
+        known[0] = FORCES_ONLY
+    known[0] |= KEPT_BY_EXTENSION
 
 
 @kernel

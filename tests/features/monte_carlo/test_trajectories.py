@@ -66,7 +66,7 @@ def test_a_rejected_trajectory_leaves_no_trace():
     for k in range(1, 30):
         before = now.copy()
         engine.advance(now, scheme, dt, 5 * k, observed=True)
-        ended, accepted, *_ = engine.trajectories
+        ended, accepted, *_ = engine.extension_sums
         if ended - accepted > len(seen):
             seen.append(k)
             assert np.array_equal(now.position, before.position) and np.array_equal(
@@ -296,9 +296,9 @@ def test_every_metropolis_test_has_its_own_random_number():
         for name in ("position", "rotation", "velocity", "angular_momentum_body"):
             getattr(now, name)[:] = getattr(kept, name)
         engine.forget()
-        before, steps = engine.trajectories, steps + 5
+        before, steps = engine.extension_sums, steps + 5
         engine.advance(now, scheme, dt, steps, observed=True)
-        _, accepted, _, chance, _ = engine.trajectories - before
+        _, accepted, _, chance, _ = engine.extension_sums - before
         return chance, accepted
 
     dt = next(dt for dt in np.arange(0.003, 0.02, 0.0005).tolist() if 0.2 < again(dt)[0] < 0.8)
