@@ -41,6 +41,9 @@ class Row:
     acts: bool = False  # whether it changes systems: a scene that uses it cannot do without
     #: Methods of its `Feature` that are called by their name, and not for scenes with its keys
     provides: tuple[str, ...] = ()
+    #: Kind of scenes that it adds, by the table that only these have, such as "body". A module of
+    #: this name in its folder `keys` has their class as `SCENE`
+    kind: str = ""
     commands: tuple[str, ...] = ()  # modules of its folder `commands`
     formats: tuple[str, ...] = ()  # modules that register file formats
     analyses: tuple[str, ...] = ()  # modules that register analyses

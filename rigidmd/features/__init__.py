@@ -12,6 +12,7 @@ FEATURES = (
         "bodies",
         "a single rigid body: tops, gyroscopes, bodies in a fluid, satellites",
         needs=("potentials", "studies", "view"),
+        kind="body",
     ),
     Row(
         "external",

@@ -1,28 +1,32 @@
-"""Scenes: `Scene.read(path)` returns the scene of molecules or of a single body."""
+"""Scenes: `Scene.read(path)` returns the scene of molecules, or of a kind that a feature adds."""
 
 from typing import TYPE_CHECKING, TypeGuard
 
-from rigidmd.features.bodies.keys.body import BodyScene
 from rigidmd.scene.base import Scene, parse_override
 
 if TYPE_CHECKING:
+    from rigidmd.features.bodies.keys.body import BodyScene
     from rigidmd.scene.json_schema import schema
     from rigidmd.scene.molecules import MolecularScene
+
+    OneScene = MolecularScene | BodyScene
 
 __all__ = ["BodyScene", "MolecularScene", "Scene", "is_molecular", "parse_override", "schema"]
 
 
 def is_molecular(scene: Scene) -> "TypeGuard[MolecularScene]":
     """Whether a scene is of molecules."""
-    return not isinstance(scene, BodyScene)
+    return scene.kind == "molecules"
 
 
 def __getattr__(name: str) -> object:
-    """What only molecules need, which a run of a single body does not load."""
-    if name == "MolecularScene":
-        from rigidmd.scene.molecules import MolecularScene
+    """What not every scene needs. A run loads its kind of scene only."""
+    from rigidmd.scene.kinds import scene_class
 
-        return MolecularScene
+    if name == "MolecularScene":
+        return scene_class("molecules")
+    if name == "BodyScene":
+        return scene_class("body")
     if name == "schema":
         from rigidmd.scene.json_schema import schema
 

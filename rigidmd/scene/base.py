@@ -52,10 +52,7 @@ from rigidmd.scene.validation import (
 )
 
 if TYPE_CHECKING:
-    from rigidmd.features.bodies.keys.body import BodyScene
-    from rigidmd.scene.molecules import MolecularScene
-
-    KindOfScene = type[MolecularScene] | type[BodyScene]
+    from rigidmd.scene import OneScene
 
 LONGEST_NAME = 100
 #: Largest number of characters of the name of a file. File systems allow 255, which temporary files
@@ -79,12 +76,17 @@ FOREIGN_INPUTS = {
     "Python": re.compile(r".*\.(py|ipynb)"),
 }
 PathName = str | os.PathLike
-AnyScene = TypeVar("AnyScene", "MolecularScene", "BodyScene")
+AnyScene = TypeVar("AnyScene", bound="Scene")
 
 
 class Scene(Section, Displayed):
-    """The description of a run, read by `Scene.read(path)`: a `BodyScene` if it has [body], else a
-    `MolecularScene`."""
+    """The description of a run, read by `Scene.read(path)`, as a scene of the kind that its tables
+    show: `MolecularScene`, or one of a feature."""
+
+    kind: ClassVar[str] = ""
+    """The table that only scenes of this kind have"""
+    subject: ClassVar[str] = ""
+    """What moves, for messages"""
 
     name: Annotated[str, Field(pattern=r"^[\w][\w.\-]*$", max_length=LONGEST_NAME)] = "scene"
     """Name of the run. Default: the name of the file"""
@@ -145,10 +147,7 @@ class Scene(Section, Displayed):
         SceneError
             If the end cannot be set.
         """
-        raise SceneError(
-            self.source,
-            [f"{option('until')} is for molecules. Set run.duration_s of a single body"],
-        )
+        raise NotImplementedError
 
     def path(self, file: str) -> Path:
         """Path of a file that the scene names relative to its folder, absolute if the working
@@ -178,11 +177,9 @@ class Scene(Section, Displayed):
     def read(cls: type[AnyScene], path: PathName, overrides: Json | None = None) -> AnyScene: ...
     @overload
     @classmethod
-    def read(
-        cls, path: PathName, overrides: Json | None = None
-    ) -> "MolecularScene | BodyScene": ...
+    def read(cls, path: PathName, overrides: Json | None = None) -> "OneScene": ...
     @classmethod
-    def read(cls, path: PathName, overrides: Json | None = None) -> "MolecularScene | BodyScene":
+    def read(cls, path: PathName, overrides: Json | None = None) -> "Scene":
         """The scene in a TOML file, with single keys overridden: {"stages.1.timestep_fs": 4}.
 
         An override of None removes the key. Files named in the scene must lie in its folder or
@@ -219,7 +216,7 @@ class Scene(Section, Displayed):
         source: str = "scene",
         text: str = "",
         embedded_files: dict[str, bytes] | None = None,
-    ) -> "MolecularScene | BodyScene": ...
+    ) -> "OneScene": ...
     @classmethod
     def from_dict(
         cls,
@@ -229,7 +226,7 @@ class Scene(Section, Displayed):
         source: str = "scene",
         text: str = "",
         embedded_files: dict[str, bytes] | None = None,
-    ) -> "MolecularScene | BodyScene":
+    ) -> "Scene":
         """The scene as a nested dictionary, as a TOML file gives it.
 
         Numbers and arrays of NumPy and paths are accepted as numbers, lists and texts. The
@@ -249,9 +246,11 @@ class Scene(Section, Displayed):
         """
         folder, data = Path(folder), plain_values(data)
         overrides = {key: plain_values(value) for key, value in (overrides or {}).items()}
-        kind = _kind_of_scene(data) if cls is Scene else cast("KindOfScene", cls)
+        from rigidmd.scene.kinds import class_for, without_kind
+
+        kind = class_for(data) if cls is Scene else cls
         if kind is None:
-            raise SceneError(source, ["has neither [body], for a single body, nor [[molecules]]"])
+            raise SceneError(source, [without_kind()])
         faults, overridden = [], []
         for named, value in overrides.items():
             is_file = isinstance(value, str) and FILE_KEYS.fullmatch(named)
@@ -441,24 +440,6 @@ def file_name(wanted: Callable[[Format], object]) -> AfterValidator:
         return name
 
     return AfterValidator(check)
-
-
-def _kind_of_scene(data: dict) -> "KindOfScene | None":
-    """The class of scenes with these tables. None if no table belongs to either class."""
-    from rigidmd.features.bodies.keys.body import BodyScene
-
-    if "body" in data:
-        return BodyScene
-    from rigidmd.scene.molecules import MolecularScene  # not for single bodies
-
-    if "molecules" in data:
-        return MolecularScene
-    count = {
-        kind: len(set(data) & set(kind.model_fields) - set(Scene.model_fields))
-        for kind in (BodyScene, MolecularScene)
-    }
-    best = max(count, key=lambda kind: count[kind])
-    return best if count[best] > 0 else None
 
 
 def _removal_hint(fault: str, data: dict, overridden: Iterable[str]) -> str:

@@ -8,7 +8,6 @@ from pathlib import Path
 from pydantic import BaseModel
 
 from rigidmd.core.plain_text import did_you_mean, plain_letters, suggestion
-from rigidmd.features import FEATURES
 from rigidmd.scene.table_in_file import TableInFile
 
 FOREIGN_KEYS = Path(__file__).with_name("foreign_keys.toml")
@@ -20,16 +19,6 @@ TABLES = {
     "structure": ("input", "coordinates", "configuration"),
     "output": ("files", "reporters", "dump"),
 }
-#: Keys of the top level that only a scene of molecules has, and only one of a single body.
-OF_MOLECULES = (
-    *("box", "engine", "fields", "forces", "from_python", "molecules", "precision", "seed"),
-    *("stages", "structure", "threads"),
-    *(row.keys[0] for row in FEATURES if row.acts and "." not in row.keys[0]),
-)
-OF_A_BODY = (
-    *("applied", "body", "changing_inertia", "fluid"),
-    *("frame", "friction", "gravity", "wheels"),
-)
 MOST_LISTED = 8  # known keys in a message
 BOHR = 0.529177210903  # Å
 CELSIUS = ("C", "degC", "celsius")
@@ -89,12 +78,20 @@ def hint_on_key(name: str, keys: list, value: object, model: type[BaseModel]) ->
         return foreign
     if not keys and (table := _table_of(name, known)):
         return f"; did you mean {table}?"
-    for kind, others in (("molecules", OF_MOLECULES), ("a single body", OF_A_BODY)):
-        if not keys and name in others:
-            return f"; only a scene of {kind} has it"
+    if not keys and (subject := _only_subject(name)):
+        return f"; only a scene of {subject} has it"
     if not is_start and (elsewhere := _elsewhere(name, keys, model)):
         return elsewhere
     return did_you_mean(name, known) or _listed(name, known)
+
+
+def _only_subject(name: str) -> str:
+    """What moves in the only kind of scenes that have a key at the top level. Empty if several or
+    none have it."""
+    from rigidmd.scene.kinds import scene_classes  # they are validated with these hints
+
+    subjects = [scene.subject for scene in scene_classes() if name in scene.model_fields]
+    return subjects[0] if len(subjects) == 1 else ""
 
 
 def _other_unit(name: str, value: object, known: list[str]) -> str:

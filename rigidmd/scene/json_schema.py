@@ -9,39 +9,52 @@ from pydantic.json_schema import (
 )
 
 from rigidmd.core.toml import Json
-from rigidmd.features.bodies.keys.body import BodyScene
+from rigidmd.scene.base import Scene
+from rigidmd.scene.kinds import scene_classes
 from rigidmd.scene.models import available_models
-from rigidmd.scene.molecules import MolecularScene
 
 
 def schema() -> Json:
-    """The JSON schema of scene files: `BodyScene` for a file with a table [body], else
-    `MolecularScene`."""
-    kinds: list[tuple[type[BaseModel], JsonSchemaMode]] = [
-        (BodyScene, "validation"),
-        (MolecularScene, "validation"),
-    ]
-    _, document = models_json_schema(kinds, schema_generator=_TomlSchema)
-    document["$defs"]["Molecules"]["properties"]["model"]["enum"] = available_models()
-    # other names need [[integrators]]
-    for kind, section in (("MolecularScene", "Stage"), ("BodyScene", "Run")):
-        enum = document["$defs"][section]["properties"]["integrator"].pop("enum")
-        known = {"properties": {"integrator": {"enum": enum}}}
-        sections = {"run": known} if section == "Run" else {"stages": {"items": known}}
-        document["$defs"][kind] |= {
-            "if": {"required": ["integrators"]},
-            "else": {"properties": sections},
-        }
+    """The JSON schema of scene files, of the kind whose table a file has, else of molecules."""
+    *others, molecules = kinds = scene_classes()
+    models: list[tuple[type[BaseModel], JsonSchemaMode]] = [(kind, "validation") for kind in kinds]
+    _, document = models_json_schema(models, schema_generator=_TomlSchema)
+    definitions = document["$defs"]
+    definitions["Molecules"]["properties"]["model"]["enum"] = available_models()
+    for kind in kinds:
+        _name_integrators(definitions, definitions[kind.__name__])
+    chosen: Json = _reference(molecules)
+    for kind in others:
+        chosen = {"if": {"required": [kind.kind]}, "then": _reference(kind), "else": chosen}
+    subjects = " or ".join(kind.subject for kind in (molecules, *others))
     return {
         "$schema": GenerateJsonSchema.schema_dialect,
         "title": "A scene of rigidmd",
-        "description": "Moving molecules or a single body, as `rigidmd run` takes them.",
+        "description": f"Moving {subjects}, as `rigidmd run` takes them.",
         "type": "object",
-        "if": {"required": ["body"]},
-        "then": {"$ref": "#/$defs/BodyScene"},
-        "else": {"$ref": "#/$defs/MolecularScene"},
+        **chosen,
         **document,
     }
+
+
+def _reference(kind: type[Scene]) -> Json:
+    return {"$ref": f"#/$defs/{kind.__name__}"}
+
+
+def _name_integrators(definitions: Json, scene: Json) -> None:
+    """Require a known integrator in the section of a scene that has one, unless [[integrators]] adds
+    others."""
+    for key, section in scene["properties"].items():
+        name = section.get("items", section).get("$ref", "").rpartition("/")[2]
+        integrator = definitions.get(name, {}).get("properties", {}).get("integrator")
+        if integrator is None or "enum" not in integrator:
+            continue
+        known = {"properties": {"integrator": {"enum": integrator.pop("enum")}}}
+        one_or_all = {"items": known} if "items" in section else known
+        scene |= {
+            "if": {"required": ["integrators"]},
+            "else": {"properties": {key: one_or_all}},
+        }
 
 
 class _TomlSchema(GenerateJsonSchema):

@@ -198,6 +198,8 @@ class MatterKeys(Scene):
 class MolecularScene(CouplingKeys, MatterKeys):
     """A scene of moving molecules."""
 
+    kind: ClassVar[str] = "molecules"
+    subject: ClassVar[str] = "molecules"
     SIZES: ClassVar[tuple[float, float]] = SIZES
 
     start: Start = Start.model_construct()

@@ -96,7 +96,7 @@ TESTED_BY = {
     "run/test_results.py": "engines/observables",
     "run/test_simulation.py": "engines/sites engines/system run/loop run/molecular run/part",
     "run/test_summary.py": "run/report run/short_report",
-    "scene/test_hints.py": "scene/base scene/stage",
+    "scene/test_hints.py": "scene/base scene/kinds scene/stage",
     "scene/test_thermostats.py": "scene/ensemble_methods scene/ensembles",
     "scene/test_validation.py": "errors",
     "scene/test_molecules.py": "assemble/model_text commands/models formats/bonds io/scene_file",

@@ -9,7 +9,6 @@ from support.common import ROOT, small_scene
 
 from rigidmd.errors import SceneError
 from rigidmd.scene import BodyScene, MolecularScene, Scene, schema
-from rigidmd.scene.hints import OF_A_BODY, OF_MOLECULES
 from rigidmd.scene.stage import Stage
 
 FOREIGN = tomllib.loads((ROOT / "rigidmd/scene/foreign_keys.toml").read_text(encoding="utf-8"))
@@ -93,12 +92,6 @@ def test_a_hint_on_units_tables_and_keys_of_other_tables(changes, expected):
     with pytest.raises(SceneError) as raised:
         Scene.from_dict(LIQUID | changes)
     assert expected in str(raised.value)
-
-
-def test_a_key_of_the_other_kind_of_scene_is_known():
-    molecules, body = set(MolecularScene.model_fields), set(BodyScene.model_fields)
-    assert set(OF_MOLECULES) == molecules - body
-    assert set(OF_A_BODY) == body - molecules
 
 
 def test_a_single_body_has_no_engine(printed):

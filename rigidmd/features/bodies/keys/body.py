@@ -4,7 +4,7 @@ throughout.
 The equations contain no physical constants, so any other consistent units work as well.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, Strict, ValidationInfo, field_validator
@@ -19,6 +19,7 @@ from rigidmd.core.integrators import (
     auto_errors,
 )
 from rigidmd.core.toml import Json
+from rigidmd.errors import SceneError, option
 from rigidmd.features.bodies.keys.forces import (
     Applied,
     ChangingInertia,
@@ -499,6 +500,9 @@ class BodyWatch(Section):
 class BodyScene(Scene):
     """One body that moves."""
 
+    kind: ClassVar[str] = "body"
+    subject: ClassVar[str] = "a single body"
+
     body: BodyTable
     start: BodyStart = BodyStart.model_construct()
     gravity: Gravity | None = None
@@ -518,6 +522,12 @@ class BodyScene(Scene):
         how = "" if run.is_auto else f" in {run.steps} steps of {run.timestep_s:g} s"
         pinned = ", pinned" if self.body.pinned else ""
         return f"{self.name}: one body{pinned}; {run.duration_s:g} s{how}, {run.integrator}"
+
+    def with_end(self, time: float) -> "BodyScene":
+        raise SceneError(
+            self.source,
+            [f"{option('until')} is for molecules. Set run.duration_s of a single body"],
+        )
 
     @classmethod
     def contradictions(cls, data: Json, text: str) -> list[str]:
@@ -581,5 +591,6 @@ class BodyScene(Scene):
             yield f"output.interval_s = {self.output.interval_s:g} is longer than run.duration_s"
 
 
+SCENE = BodyScene
 SAMPLES = 2000  # of the motion of a body
 FORMULATION = "matrix"
