@@ -1,8 +1,10 @@
-"""The sites of a system, as output and analysis read them."""
+"""The system of a scene of any kind and its sites, as runs, output and analysis use them."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+
+from rigidmd.core.state import State
 
 
 class Sites(NamedTuple):
@@ -16,3 +18,25 @@ class Sites(NamedTuple):
 
     def __repr__(self) -> str:
         return f"<Sites: {len(self.name)} of {len(np.unique(self.molecule))} molecules>"
+
+
+class AnySystem(Protocol):
+    """The system of a scene of any kind."""
+
+    @property
+    def scene(self) -> Any: ...  # resolved
+    @property
+    def state(self) -> State: ...  # at the start
+    @property
+    def notes(self) -> list[str]: ...
+    @property
+    def warnings(self) -> list[str]: ...
+    @property
+    def sites(self) -> Sites: ...
+    @property
+    def charges(self) -> np.ndarray: ...  # (s,) e
+    @property
+    def residue_names(self) -> np.ndarray: ...
+    def connections(self, *, massless: bool = False) -> np.ndarray: ...  # (b, 2) joined sites
+    def site_positions(self, state: State, wrapped: bool = False) -> np.ndarray: ...
+    def site_velocities(self, state: State) -> np.ndarray: ...

@@ -19,6 +19,7 @@ from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.space import Space, space_of, wrap
 from rigidmd.forces.parts import Tail, gather_per_molecule
 from rigidmd.forces.terms import trait
+from rigidmd.formats.bonds import connections
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import Molecule
 from rigidmd.units import GRAM_PER_CM3
@@ -299,6 +300,15 @@ class System:
     def of_sites(self, of: Callable[[Molecule], np.ndarray]) -> np.ndarray:
         """Values of all sites (s,). `of` returns the values of one molecule."""
         return gather_per_molecule([of(m) for m in self.species], self.model.species)
+
+    @property
+    def charges(self) -> np.ndarray:
+        """Charges (s,) of all sites, e."""
+        return self.of_sites(lambda m: m.charges)
+
+    def connections(self, *, massless: bool = False) -> np.ndarray:
+        """Pairs (b, 2) of sites that bonds join, see `formats.bonds.connections`."""
+        return connections(self, massless=massless)
 
     def site_positions(self, state: State, wrapped: bool = False) -> np.ndarray:
         """Positions (s, 3) of all sites, lab frame, Å. Molecules are whole; wrapped: centres of

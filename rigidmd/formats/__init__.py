@@ -18,7 +18,7 @@ import numpy as np
 
 from rigidmd.features import modules
 from rigidmd.formats.atoms import Atoms, Frame
-from rigidmd.formats.systems import System
+from rigidmd.formats.systems import Placed
 
 if TYPE_CHECKING:
     from rigidmd.formats.frame_file import FrameFile
@@ -77,7 +77,7 @@ class Format(NamedTuple):
     # with the head of the file. `counter` is the position and the `struct` format of the number of
     # frames in the file. `writer` is a class for all other formats of molecules, see
     # `frame_file.FrameFile`.
-    encoder: Callable[[System, float, bool], Encode] | None = None
+    encoder: Callable[[Placed, float, bool], Encode] | None = None
     counter: tuple[int, str] = (0, "")
     writer: "type[FrameFile] | None" = None
     reader: Callable[[Path], FrameReader] | None = None  # default: the reader of MDAnalysis

@@ -23,10 +23,12 @@ class Sites(Protocol):
 
 
 class Placed(Protocol):
-    """What both systems have."""
+    """What systems of all kinds have."""
 
     @property
     def state(self) -> State: ...
+    @property
+    def sites(self) -> Sites: ...
     @property
     def residue_names(self) -> np.ndarray: ...
     def site_positions(self, state: State, wrapped: bool = False) -> np.ndarray: ...
@@ -81,40 +83,3 @@ class MolecularSystem(Placed, Protocol):
     def residue_number(self) -> np.ndarray: ...
     def of_sites(self, of: Callable[[Species], np.ndarray]) -> np.ndarray: ...
     def centres(self, state: State, wrapped: bool = False) -> np.ndarray: ...
-
-
-class Solid(Protocol):
-    @property
-    def shape(self) -> str: ...
-
-
-class BodyTable(Protocol):
-    """The table [body] of a scene."""
-
-    @property
-    def points(self) -> Sequence[object] | None: ...
-    @property
-    def solids(self) -> Sequence[Solid] | None: ...
-
-
-class BodyScene(Protocol):
-    @property
-    def body(self) -> BodyTable: ...
-
-
-class BodySystem(Placed, Protocol):
-    """An `engines.body_system.BodySystem`."""
-
-    @property
-    def sites(self) -> Sites: ...
-    @property
-    def scene(self) -> BodyScene: ...
-    @property
-    def points(self) -> np.ndarray: ...  # (k, 3)
-    @property
-    def centre(self) -> np.ndarray: ...  # (3,)
-    @property
-    def translates(self) -> bool: ...
-
-
-System = MolecularSystem | BodySystem

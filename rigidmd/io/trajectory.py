@@ -20,12 +20,10 @@ from MDAnalysis.lib.distances import minimize_vectors, self_capped_distance
 
 from rigidmd.core.process import ignore_warnings
 from rigidmd.core.state import State
-from rigidmd.engines.system import System
+from rigidmd.engines.sites import AnySystem
 from rigidmd.errors import OutputError, StructureError
-from rigidmd.features.bodies.system import BodySystem
 from rigidmd.formats import BY_EXTENSION
 from rigidmd.formats.atoms import Frame
-from rigidmd.formats.bonds import charges, connections
 from rigidmd.formats.through_mdanalysis import (
     TrajectoryReader,
     dimensions,
@@ -42,7 +40,7 @@ T = TypeVar("T")
 Reader = TypeVar("Reader", bound=ProtoReader)
 
 
-def universe(system: System | BodySystem, state: State, wrapped: bool = True) -> mda.Universe:
+def universe(system: AnySystem, state: State, wrapped: bool = True) -> mda.Universe:
     """An MDAnalysis Universe of all sites, one residue per molecule, with one frame of this
     state."""
     u = universe_of(system)
@@ -51,17 +49,17 @@ def universe(system: System | BodySystem, state: State, wrapped: bool = True) ->
     return u
 
 
-def _connect(u: mda.Universe, system: System | BodySystem, *, massless: bool = True) -> None:
+def _connect(u: mda.Universe, system: AnySystem, *, massless: bool = True) -> None:
     """Add charges and bonds. Earlier bonds are replaced."""
     if hasattr(u.atoms, "bonds"):
         u.del_TopologyAttr("bonds")
-    u.add_TopologyAttr("charges", charges(system))
+    u.add_TopologyAttr("charges", system.charges)
     u.add_TopologyAttr(
-        "bonds", [tuple(pair) for pair in connections(system, massless=massless).tolist()]
+        "bonds", [tuple(pair) for pair in system.connections(massless=massless).tolist()]
     )
 
 
-def in_memory(system: System | BodySystem, frames: Sequence[Frame]) -> mda.Universe:
+def in_memory(system: AnySystem, frames: Sequence[Frame]) -> mda.Universe:
     """A Universe of frames in memory, each with its time and box."""
     u = universe(system, system.state)
     _connect(u, system)
@@ -76,7 +74,7 @@ def in_memory(system: System | BodySystem, frames: Sequence[Frame]) -> mda.Unive
 
 
 def from_files(
-    system: System | BodySystem, topology: Path, trajectory: Path, times: list[float]
+    system: AnySystem, topology: Path, trajectory: Path, times: list[float]
 ) -> mda.Universe:
     """The Universe of a finished run's files, with these times (ps) of its frames, and elements,
     masses and bonds."""

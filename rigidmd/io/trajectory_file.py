@@ -13,13 +13,12 @@ from rigidmd.core.state import State
 from rigidmd.errors import SimulationError
 from rigidmd.formats import BY_EXTENSION, Topology, written
 from rigidmd.formats.atoms import Frame
-from rigidmd.formats.bonds import connections
 from rigidmd.formats.frame_file import FrameFile
 from rigidmd.scene.validation import not_none
 
 if TYPE_CHECKING:
+    from rigidmd.engines.sites import AnySystem
     from rigidmd.engines.system import System
-    from rigidmd.features.bodies.system import BodySystem
 
 #: Formats of trajectories that hold any positions at any times.
 UNLIMITED = written(lambda form: form.encoder and form.limits == (-inf, inf) and not form.even)
@@ -27,7 +26,7 @@ UNLIMITED = written(lambda form: form.encoder and form.limits == (-inf, inf) and
 
 def open_trajectory(
     path: Path,
-    system: "System | BodySystem",
+    system: "AnySystem",
     interval: float,
     *,
     velocities: bool,
@@ -40,9 +39,7 @@ def open_trajectory(
     return TrajectoryFile(path, system, interval, velocities, wrapped, kept)
 
 
-def write_topology(
-    path: Path, system: "System | BodySystem", state: State, *, wrapped: bool
-) -> None:
+def write_topology(path: Path, system: "AnySystem", state: State, *, wrapped: bool) -> None:
     """Write names, molecules and first positions for viewers. Raises SimulationError if the format
     cannot hold one."""
     positions = system.site_positions(state, wrapped)
@@ -56,7 +53,7 @@ def write_topology(
         system.residue_names[molecule].tolist(),
         positions,
         state.cell if np.isfinite(state.cell).all() else None,
-        lambda: connections(system),  # without massless sites, to which viewers would draw bonds
+        system.connections,  # without massless sites, to which viewers would draw bonds
     )
     write_text(path, not_none(BY_EXTENSION[path.suffix].topology)(topology))
 
@@ -87,7 +84,7 @@ class TrajectoryFile(AppendedFile):
     def __init__(
         self,
         path: Path,
-        system: "System | BodySystem",
+        system: "AnySystem",
         interval: float,
         velocities: bool,
         wrapped: bool,

@@ -42,8 +42,8 @@ def _reference(kind: type[Scene]) -> Json:
 
 
 def _name_integrators(definitions: Json, scene: Json) -> None:
-    """Require a known integrator in the section of a scene that has one, unless [[integrators]] adds
-    others."""
+    """Require a known integrator in the section of a scene that has one, unless [[integrators]]
+    adds others."""
     for key, section in scene["properties"].items():
         name = section.get("items", section).get("$ref", "").rpartition("/")[2]
         integrator = definitions.get(name, {}).get("properties", {}).get("integrator")

@@ -8,7 +8,7 @@ import pytest
 from support.common import ROOT, small_scene
 
 from rigidmd.errors import SceneError
-from rigidmd.scene import BodyScene, MolecularScene, Scene, schema
+from rigidmd.scene import Scene, schema
 from rigidmd.scene.stage import Stage
 
 FOREIGN = tomllib.loads((ROOT / "rigidmd/scene/foreign_keys.toml").read_text(encoding="utf-8"))

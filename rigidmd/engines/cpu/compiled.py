@@ -1,4 +1,4 @@
-"""What the engines of compiled code share, for molecules and for a single body.
+"""What all engines of compiled code share.
 
 This is the Python side of the kernels: it owns their lists, grids, sums and machine code, enlarges
 arrays when a kernel returns that one is full, and raises exceptions for status codes.
@@ -7,7 +7,7 @@ arrays when a kernel returns that one is full, and raises exceptions for status 
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -42,10 +42,6 @@ from rigidmd.forces.terms import (
 )
 from rigidmd.mechanics.free_rotor import NO_SYMMETRY, ExactRotor, SplitRotor
 
-if TYPE_CHECKING:
-    from rigidmd.dynamics.model import Model
-    from rigidmd.features.bodies.step_loop import Body
-
 #: Owner of arrays in `Engine.memory` besides the terms.
 LOAD = "load"
 #: When the passes of terms act, by what the engine uses them for.
@@ -71,12 +67,11 @@ class LastAdvance:
     )
 
 
-ModelT = TypeVar("ModelT", "Model", "Body")
 #: What an engine binds to a state and its load.
 Bound = TypeVar("Bound")
 
 
-class CompiledEngine(Engine, Generic[ModelT, Bound]):
+class CompiledEngine(Engine, Generic[Bound]):
     """An engine of compiled code.
 
     model : the constant part of the system
@@ -86,11 +81,11 @@ class CompiledEngine(Engine, Generic[ModelT, Bound]):
     """
 
     is_repeatable = True
-    model: ModelT
+    model: Any  # a NamedTuple with a rotor
 
     def __init__(
         self,
-        model: ModelT,
+        model: Any,
         terms: dict[str, NamedTuple],
         setup: Setup,
         python_forces: dict[str, Callable] | None,
@@ -115,7 +110,7 @@ class CompiledEngine(Engine, Generic[ModelT, Bound]):
         """Name of a term -> its present workspace. Empty before the first use."""
         return dict(zip(self.names, self._workspaces or (), strict=False))
 
-    def change(self, model: ModelT, terms: dict[str, NamedTuple]) -> None:
+    def change(self, model: Any, terms: dict[str, NamedTuple]) -> None:
         self.model, self.terms = model, terms
         self._workspaces = None
         self.forget()
@@ -173,7 +168,7 @@ class CompiledEngine(Engine, Generic[ModelT, Bound]):
     def _new_dispatcher(self, use: str, workspaces: tuple[NamedTuple, ...]) -> TermDispatcher:
         return TermDispatcher(workspaces, USES[use], with_rates=use == "steps")
 
-    def model_for(self, scheme: Scheme) -> ModelT:
+    def model_for(self, scheme: Scheme) -> Any:
         """The model with the rotor of a scheme. The exact rotor differs only for asymmetric
         bodies."""
         rotor = self.model.rotor

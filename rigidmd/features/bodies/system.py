@@ -12,6 +12,7 @@ from rigidmd.core.state_file import array_errors
 from rigidmd.engines.sites import Sites
 from rigidmd.errors import SimulationError
 from rigidmd.features.bodies.cpu_engine import BodyEngine
+from rigidmd.features.bodies.edges import edges_of
 from rigidmd.features.bodies.forces.resistance import NoResistance
 from rigidmd.features.bodies.keys.body import FORMULATION, SAMPLES
 from rigidmd.features.bodies.step_loop import Body
@@ -297,6 +298,14 @@ class BodySystem:
             np.full(n, "X", dtype=object),
             np.full(n, self.mass / n),
         )
+
+    @property
+    def charges(self) -> np.ndarray:
+        return np.zeros(len(self.points))
+
+    def connections(self, *, massless: bool = False) -> np.ndarray:
+        """Pairs (b, 2) of points that are joined, see `edges_of`."""
+        return edges_of(self)
 
     @property
     def residue_names(self) -> np.ndarray:

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from rigidmd.core.state import State
 from rigidmd.formats import Format, register
 from rigidmd.formats.atoms import SAME_MASS, Atoms, Frame, names_of_types, structure_error
-from rigidmd.formats.bonds import charges, connections
+from rigidmd.formats.bonds import connections
 from rigidmd.formats.cells import make_whole
 from rigidmd.formats.frame_file import FrameFile
 from rigidmd.formats.systems import MolecularSystem, Species
@@ -304,7 +304,7 @@ class GsdFile(FrameFile["HOOMDTrajectory", "HoomdFrame"]):
         mass = np.array([m.mass for m in system.species])[species]
         moments = np.array([m.inertia for m in system.species])[species]
         charge = np.zeros(len(label))
-        charge[particle] = charges(system)
+        charge[particle] = system.of_sites(lambda m: m.charges)
         central = set(label[:n][~single])
         self._constant = {
             "types": types,

@@ -8,7 +8,6 @@ from rigidmd import Scene, Simulation
 from rigidmd.commands import cli
 from rigidmd.features.bodies.assemble import build_body
 from rigidmd.features.bodies.mesh import UNITS, mesh_of
-from rigidmd.formats.bonds import connections
 from rigidmd.mechanics.inertia import SOLIDS, shifted_inertia, solid
 
 
@@ -238,4 +237,4 @@ def test_a_body_without_a_solid_is_drawn_as_the_cuboid_of_its_inertia():
 )
 def test_edges_of_solids(body, edges):
     scene = Scene.from_dict({"body": body, "run": {"duration_s": 1.0, "timestep_s": 0.1}})
-    assert len(connections(build_body(scene))) == edges
+    assert len(build_body(scene).connections()) == edges
