@@ -1,7 +1,6 @@
 """The public names of rigidmd, and the modules that have them."""
 
 from .assemble.scenes import atoms_of as atoms_of
-from .assemble.scenes import resolve as resolve
 from .assemble.scenes import scene_from_atoms as scene_from_atoms
 from .features import view as view
 from .features.analysis import analysis as analysis
@@ -27,6 +26,7 @@ from .run import Observer as Observer
 from .run import Results as Results
 from .run import Simulation as Simulation
 from .run import run_together as run_together
+from .run.kind import resolve as resolve
 from .scene import BodyScene as BodyScene
 from .scene import MolecularScene as MolecularScene
 from .scene import Scene as Scene

@@ -44,6 +44,7 @@ class Row:
     #: Kind of scenes that it adds, by the table that only these have, such as "body". A module of
     #: this name in its folder `keys` has their class as `SCENE`
     kind: str = ""
+    kind_title: str = ""  # of its examples
     commands: tuple[str, ...] = ()  # modules of its folder `commands`
     formats: tuple[str, ...] = ()  # modules that register file formats
     analyses: tuple[str, ...] = ()  # modules that register analyses
@@ -86,6 +87,10 @@ class Row:
 class Feature:
     """What a feature does for scenes of molecules that use it. A method that a feature does not
     have adds nothing."""
+
+    def kind(self) -> object:
+        """The kind of scene that it adds, a `run.kind.Kind`. None without one."""
+        return None
 
     def resolve(self, scene: Scene, species: list) -> tuple[Scene, list[str]]:
         """The scene with the defaults of the feature, and error messages.

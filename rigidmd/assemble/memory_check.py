@@ -12,27 +12,23 @@ import numpy as np
 from rigidmd.core.process import format_gigabytes, free_memory, memory_shortage
 from rigidmd.core.state import no_load
 from rigidmd.errors import SceneError
-from rigidmd.scene.validation import not_none
 
 if TYPE_CHECKING:
     from rigidmd.engines.system import System
-    from rigidmd.scene import BodyScene, MolecularScene
+    from rigidmd.scene import MolecularScene
 
 #: Bytes per molecule and site of a system while it is built; measured per site: 310 of argon, 500
 #: of nitrogen, 640 of SPC/E, 690 of TIP4P.
 BYTES_PER_MOLECULE, BYTES_PER_SITE = 200, 130
 #: Bytes per site if a trajectory is written, mostly by MDAnalysis; measured: 430 of SPC/E.
 BYTES_PER_TRAJECTORY_SITE = 430
-#: Bytes per sample of a body; measured: a snapshot of its state 1.9 kB, its columns at the end 0.85
-#: kB.
-BYTES_PER_SAMPLE = 2700
 #: Bytes per line of log.csv, which the run keeps as numbers (measured: 300 while it runs, 870 in
 #: the summary), and per frame of a file, whose time is kept.
 BYTES_PER_LOG_LINE, BYTES_PER_FRAME = 870, 150
 ADVICE = "take fewer molecules, a smaller box or a shorter cutoff"
 
 
-def _require(source: str, needed: float, what: str, advice: str) -> None:
+def require_memory(source: str, needed: float, what: str, advice: str) -> None:
     """Raise SceneError if a number of bytes exceeds the free memory."""
     if fault := memory_shortage(needed, what):
         raise SceneError(source, [f"not enough memory: {fault}: {advice}"])
@@ -41,24 +37,11 @@ def _require(source: str, needed: float, what: str, advice: str) -> None:
 def check_memory_of_molecules(source: str, molecules: int, sites: int) -> None:
     """Raise SceneError if these numbers of molecules and of all their sites exceed the memory."""
     needed = BYTES_PER_MOLECULE * molecules + BYTES_PER_SITE * sites
-    _require(
+    require_memory(
         source,
         needed,
         f"a system of {molecules} molecules with {sites} sites",
         "take fewer molecules",
-    )
-
-
-def check_memory_of_samples(scene: "BodyScene") -> None:
-    """Raise SceneError if the samples of a resolved scene of a body exceed the memory."""
-    run = scene.run
-    interval = not_none(scene.output.interval_s)
-    count = run.duration_s / (interval if run.is_auto else max(interval, run.timestep_s))
-    _require(
-        scene.source,
-        BYTES_PER_SAMPLE * count,
-        f"a run with {count:.3g} samples",
-        "lengthen output.interval_s",
     )
 
 
@@ -80,8 +63,8 @@ def check_memory(system: "System") -> None:
         raise SceneError(source, [f"not enough memory: {fault}: {ADVICE}"]) from None
     lines, samples = _samples(system.scene)
     longer = "lengthen output.log_interval_ps and output.trajectory_interval_ps"
-    _require(source, samples, f"a run with {lines:.3g} lines in its log", longer)
-    _require(source, needed, "the run", ADVICE)
+    require_memory(source, samples, f"a run with {lines:.3g} lines in its log", longer)
+    require_memory(source, needed, "the run", ADVICE)
 
 
 def _samples(scene: "MolecularScene") -> tuple[float, float]:

@@ -5,7 +5,7 @@ numbers that are warned of, `REFUSED` of numbers that no scene can mean.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from math import degrees, inf, pi
+from math import degrees, inf
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from rigidmd.units import GRAM_PER_CM3, KJ_PER_MOL
 
 if TYPE_CHECKING:
     from rigidmd.forces.neighbors.space import Space
-    from rigidmd.scene import BodyScene, MolecularScene
+    from rigidmd.scene import MolecularScene
     from rigidmd.scene.forces import Forces
     from rigidmd.scene.models import Molecule
 
@@ -279,23 +279,6 @@ def gravity_warnings(key: str, acceleration: tuple[float, float, float]) -> list
     warnings = _implausible([("gravity", size, key)])
     if acceleration[2] > 0.9 * size:
         warnings.append(f"{key} points up, along +z: should it be [0, 0, {-acceleration[2]:g}]?")
-    return warnings
-
-
-def body_warnings(scene: "BodyScene") -> list[str]:
-    """Warnings of numbers of a single body that are probably in another unit."""
-    if scene.gravity is None:
-        warnings = []
-    else:
-        warnings = gravity_warnings("gravity.acceleration_m_s2", scene.gravity.acceleration_m_s2)
-    for key in ("euler_angles_deg", "yaw_pitch_roll_deg"):
-        angles = getattr(scene.start, key)
-        if angles is not None and any(map(in_radians, angles)) and max(map(abs, angles)) <= 2 * pi:
-            shown = ", ".join(f"{x:g}" for x in angles)
-            inside = ", ".join(f"{degrees(x):.4g}" for x in angles)
-            warnings.append(
-                f"start.{key} is [{shown}]°: are these radians? They would be [{inside}]°"
-            )
     return warnings
 
 

@@ -1,5 +1,4 @@
-"""Public functions on scenes: with all defaults, to the start as an `ase.Atoms`, and from an
-`ase.Atoms`.
+"""Public functions on scenes: the start as an `ase.Atoms`, and scenes from an `ase.Atoms`.
 
 The atoms of such a scene are an embedded structure file, extended XYZ with every digit.
 """
@@ -14,12 +13,11 @@ import numpy as np
 from rigidmd.assemble.build import build
 from rigidmd.core.toml import Json, plain_values
 from rigidmd.errors import RigidMDWarning, SceneError
-from rigidmd.features.bodies.assemble import build_body
 from rigidmd.formats import STRUCTURE
 from rigidmd.formats.cells import cell_error
 from rigidmd.formats.through_ase import NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS, atoms_of_system
-from rigidmd.scene import BodyScene, MolecularScene
-from rigidmd.scene.base import AnyScene, with_absolute_paths
+from rigidmd.scene import MolecularScene
+from rigidmd.scene.base import with_absolute_paths
 from rigidmd.scene.molecules import Settings
 from rigidmd.scene.species import SPECIES_FILES
 
@@ -32,23 +30,9 @@ SOURCE = "atoms"  # in messages
 SHAPES = {"FixLinearTriatomic", "FixInternals"}
 
 
-def resolve(scene: AnyScene) -> AnyScene:
-    """The same scene with all defaults, which runs to the same bits. The integrator "auto" stays
-    until a run has chosen one.
-
-    Raises
-    ------
-    SceneError
-        If the scene has errors.
-    StructureError, MoleculeError
-        For molecules, if a file of a structure or of a model has errors.
-    """
-    return build_body(scene).scene if isinstance(scene, BodyScene) else build(scene).scene
-
-
 def atoms_of(scene: MolecularScene) -> "ase.Atoms":
     """The start of a run as an `ase.Atoms`, before overlaps are removed: see `Results.atoms`.
-    Raises as `resolve`."""
+    Raises as `rigidmd.resolve`."""
     system = build(scene)
     return atoms_of_system(system, system.state)
 

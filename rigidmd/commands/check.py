@@ -1,6 +1,6 @@
 """`rigidmd check`."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from rigidmd.commands.arguments import SCENE, Options, add_engine, command, flag, read_scene
 from rigidmd.commands.streams import warn
@@ -27,38 +27,31 @@ if TYPE_CHECKING:
     ),
 )
 def _check(options: Options) -> int:
-    from rigidmd.assemble.describe import describe_system
-    from rigidmd.scene import BodyScene
+    from rigidmd.run.kind import kind_of
+    from rigidmd.scene import is_molecular
 
     scene = read_scene(options)
-    if isinstance(scene, BodyScene):
-        from rigidmd.features.bodies.assemble import build_body
-        from rigidmd.run.stable_step import body_step_warnings
-
-        if options.program or options.profile:
-            option = "--program" if options.program else "--profile"
-            raise SceneError(
-                scene.source, [f"{option} is for molecules. The step of a body is one loop"]
-            )
-        body = build_body(scene)
-        print(describe_system(body))
-        warnings = [*body.warnings, *body_step_warnings(body)]
-    else:
-        from rigidmd.assemble.build import build
-        from rigidmd.assemble.time_step import step_warnings
-
-        system = build(scene)
-        print(describe_system(system))
-        if program := scene.engine.program:
-            print(program.feature.load().describe_engine(system))
-        if options.program:
-            _print_programs(system)
-        if options.profile:
-            _print_profile(scene)
-        warnings = [*system.warnings, *step_warnings(system.scene)]
-    for warning in warnings:
+    kind = kind_of(scene)
+    for option in ("program", "profile"):
+        if getattr(options, option):
+            kind.check_has(scene, f"--{option}")
+    system = kind.build(scene)
+    print(kind.describe(system))
+    if is_molecular(scene):
+        _print_more(options, cast("System", system))
+    for warning in (*system.warnings, *kind.step_warnings(system)):
         warn(warning)
     return 0
+
+
+def _print_more(options: Options, system: "System") -> None:
+    """Print what only molecules have: the comparison with another engine, programs, a profile."""
+    if program := system.scene.engine.program:
+        print(program.feature.load().describe_engine(system))
+    if options.program:
+        _print_programs(system)
+    if options.profile:
+        _print_profile(system.scene)
 
 
 def _print_programs(system: "System") -> None:

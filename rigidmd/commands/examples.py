@@ -1,6 +1,7 @@
 """`rigidmd examples`."""
 
 from rigidmd.commands.arguments import Options, command
+from rigidmd.features import FEATURES
 
 
 @command(10, "list the scenes, notebooks and scripts that rigidmd ships", "rigidmd examples")
@@ -8,9 +9,12 @@ def _examples(options: Options) -> int:
     from rigidmd.core.shipped import NOTEBOOKS, SCRIPTS, examples
 
     scenes = examples()
+    titles = {"molecules": "molecules"} | {row.kind: row.kind_title for row in FEATURES if row.kind}
     kinds = {
-        "molecules": [example for example in scenes if not example.is_body],
-        "one body": [example for example in scenes if example.is_body],
+        **{
+            title: [example for example in scenes if table in example.tables]
+            for table, title in titles.items()
+        },
         "notebooks": examples(NOTEBOOKS),
         "scripts, which extend it": examples(SCRIPTS),
     }

@@ -16,7 +16,6 @@ from rigidmd.commands.arguments import (
     time_ps,
 )
 from rigidmd.commands.streams import announce, warn
-from rigidmd.errors import SceneError
 
 #: Options of a run that starts or continues.
 DURATION = (
@@ -65,14 +64,11 @@ DURATION = (
     writes=True,
 )
 def run(options: Options) -> int:
-    from rigidmd.scene import BodyScene
+    from rigidmd.run.kind import kind_of
 
     scene = read_scene(options)
     if options.threads is not None:
-        if isinstance(scene, BodyScene):
-            raise SceneError(
-                scene.source, ["--threads is for molecules. A single body uses one thread"]
-            )
+        kind_of(scene).check_has(scene, "--threads")
         scene = read_scene(options, threads=options.threads)
     if options.until is not None:
         scene = scene.with_end(options.until)
@@ -101,8 +97,7 @@ def run(options: Options) -> int:
     if results.interrupted:
         print(f"`rigidmd resume {quoted}` continues it")
     else:
-        more = "report" if isinstance(scene, BodyScene) else "analyse"
-        print(f"next:  rigidmd {more} {quoted}     rigidmd view {quoted}")
+        print(f"next:  rigidmd {kind_of(scene).next_command} {quoted}     rigidmd view {quoted}")
     if results.out_of_time:
         return OUT_OF_TIME
     return BY_SIGNAL + results.signal if results.signal else 0

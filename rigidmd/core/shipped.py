@@ -69,7 +69,7 @@ class Example(NamedTuple):
     name: str
     path: Path
     about: str  # the first line of its comment, or of its text
-    is_body: bool = False
+    tables: tuple[str, ...] = ()  # of a scene
 
     @property
     def kind(self) -> str:
@@ -82,10 +82,10 @@ def examples(files: str = "*.toml") -> list[Example]:
     shipped = []
     for path in SYSTEMS.glob(files):
         text = path.read_text(encoding="utf-8")
-        is_body = path.suffix == ".toml" and "body" in tomllib.loads(text)
+        tables = tuple(tomllib.loads(text)) if path.suffix == ".toml" else ()
         first = "".join(json.loads(text)["cells"][0]["source"]) if path.suffix == ".ipynb" else text
         shipped.append(
-            Example(path.stem, path, first.partition("\n")[0].removeprefix("# "), is_body)
+            Example(path.stem, path, first.partition("\n")[0].removeprefix("# "), tables)
         )
     return sorted(
         shipped,

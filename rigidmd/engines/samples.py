@@ -1,8 +1,6 @@
-"""The columns of log.csv (molecules) and motion.csv (a body), and the samples in a run of
-molecules.
+"""The columns of log.csv, and the samples in a run of molecules.
 
-One table serves files, displays and documentation. For molecules it is the record `Sample`: each
-field has a `Column`.
+One table serves files, displays and documentation, the record `Sample`: each field has a `Column`.
 """
 
 from abc import ABC, abstractmethod
@@ -26,7 +24,7 @@ if TYPE_CHECKING:
 class Column(NamedTuple):
     """Header, unit and description of a column."""
 
-    header: str  # in log.csv or motion.csv; empty for a column that is not written
+    header: str  # in the file of samples; empty for a column that is not written
     unit: str  # "1" for plain numbers, empty for text
     about: str
 
@@ -150,77 +148,9 @@ def energy_column(name: str) -> Column:
 NUMBERS = [name for name in COLUMNS if name != "stage_name"]
 
 
-class Family(NamedTuple):
-    names: tuple[str, ...]
-    unit: str
-    about: str
-
-
-BODY = {
-    "time": Family(("time",), "s", "time"),
-    "position": Family(("x", "y", "z"), "m", "centre of mass"),
-    "velocity": Family(("vx", "vy", "vz"), "m/s", "its velocity"),
-    "rotation": Family(
-        tuple(f"q{i}{j}" for i in "123" for j in "123"),
-        "1",
-        "rotation matrix Q by rows: lab = Q body",
-    ),
-    "quaternion": Family(
-        ("qw", "qx", "qy", "qz"), "1", "Q as a quaternion whose sign does not jump"
-    ),
-    "euler_angles": Family(("phi", "theta", "psi"), "rad", "Q as Euler angles, 3-1-3"),
-    "h_body": Family(
-        tuple(f"h_body_{k}" for k in (1, 2, 3)), "kg m²/s", "angular momentum of wheels, body axes"
-    ),
-    "omega_body": Family(
-        tuple(f"omega_body_{k}" for k in (1, 2, 3)), "rad/s", "angular velocity, body axes"
-    ),
-    "omega_lab": Family(
-        tuple(f"omega_lab_{k}" for k in "xyz"), "rad/s", "angular velocity, lab axes"
-    ),
-    "L_body": Family(
-        tuple(f"L_body_{k}" for k in (1, 2, 3)),
-        "kg m²/s",
-        "angular momentum with wheels, body axes",
-    ),
-    "L_lab": Family(
-        tuple(f"L_lab_{k}" for k in "xyz"), "kg m²/s", "angular momentum with wheels, lab axes"
-    ),
-    "kinetic": Family(
-        ("kinetic",), "J", "kinetic energy of I omega. Less Omega · J in a rotating frame"
-    ),
-    "potential": Family(("potential",), "J", "potential energy"),
-    "energy": Family(("energy",), "J", "kinetic and potential energy"),
-    "work": Family(("work",), "J", "work of drives and resistance: energy - work is conserved"),
-    "energy_error": Family(
-        ("energy_error",), "1", "change of energy - work, relative to the largest kinetic energy"
-    ),
-    "L_error": Family(
-        tuple(f"L_{k}_error" for k in ("lab", "size", *"xyz123")),
-        "1",
-        "change of L, relative to the largest abs(L)",
-    ),
-    "orthogonality_error": Family(("orthogonality_error",), "1", "largest entry of abs(QᵀQ - 1)"),
-}
-#: Additional key of `results[...]` for a body: several columns as one array.
+#: Key of `results[...]` for rotation matrices (n, 3, 3), where something has one: no column of a
+#: file.
 MATRIX = "Q"
-
-
-def _with_unit(name: str, unit: str) -> str:
-    """The header of a column of motion.csv, such as "phi (rad)". In ASCII, as the headers of
-    log.csv."""
-    return name if unit == "1" else f"{name} ({unit.replace('²', '^2')})"
-
-
-BODY_COLUMNS = {
-    n: Column(_with_unit(n, f.unit), f.unit, f.about) for f in BODY.values() for n in f.names
-}
-#: Header of a column of motion.csv -> its name, also without units, as earlier versions wrote them.
-BODY_HEADERS = (
-    {name: name for name in BODY_COLUMNS}
-    | {"t": "time"}
-    | {c.header: n for n, c in BODY_COLUMNS.items()}
-)
 
 
 class SampleTable(ABC):

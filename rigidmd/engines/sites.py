@@ -1,10 +1,14 @@
 """The system of a scene of any kind and its sites, as runs, output and analysis use them."""
 
-from typing import Any, NamedTuple, Protocol
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
 from rigidmd.core.state import State
+
+if TYPE_CHECKING:
+    from rigidmd.scene import OneScene
 
 
 class Sites(NamedTuple):
@@ -24,14 +28,14 @@ class AnySystem(Protocol):
     """The system of a scene of any kind."""
 
     @property
-    def scene(self) -> Any: ...  # resolved
+    def scene(self) -> "OneScene": ...  # resolved
     @property
     def state(self) -> State: ...  # at the start
     @property
     def notes(self) -> list[str]: ...
     @property
     def warnings(self) -> list[str]: ...
-    @property
+    @cached_property
     def sites(self) -> Sites: ...
     @property
     def charges(self) -> np.ndarray: ...  # (s,) e

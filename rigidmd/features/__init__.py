@@ -13,6 +13,8 @@ FEATURES = (
         "a single rigid body: tops, gyroscopes, bodies in a fluid, satellites",
         needs=("potentials", "studies", "view"),
         kind="body",
+        kind_title="one body",
+        commands=("gallery",),
     ),
     Row(
         "external",
@@ -51,7 +53,7 @@ FEATURES = (
     Row(
         "studies",
         "many runs: sweep, accuracy, comparison, stability, normal modes",
-        needs=("analysis", "bodies", "view"),
+        needs=("analysis", "view"),
         commands=("accuracy", "compare", "modes", "stability", "sweep"),
         display="sweep.notebook",
         provides=("analyse_sweep",),
@@ -85,8 +87,7 @@ FEATURES = (
     Row(
         "view",
         "figures, pages, animations, display in notebooks",
-        needs=("bodies",),
-        commands=("film", "gallery", "report", "view"),
+        commands=("film", "report", "view"),
         display="notebook",
         keys=("output.figures",),
         provides=("draw_model",),

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.formats import Encode, Format, System, Topology, register
+from rigidmd.formats import Encode, Format, Placed, Topology, register
 from rigidmd.formats.atoms import (
     Atoms,
     Frame,
@@ -177,7 +177,7 @@ def _box_lines(cell: np.ndarray | None) -> list[str]:
     return [f"CRYST1{edges}{''.join(f'{angle:7.2f}' for angle in box[3:])} P 1           1"]
 
 
-def encoder(system: System, interval: float, velocities: bool) -> Encode:
+def encoder(system: Placed, interval: float, velocities: bool) -> Encode:
     """Models, each with its time in a remark and its box before it. Bonds are in the topology."""
     files = FrameFiles(
         system, velocities=velocities, name="PDB", options={"multiframe": True, "bonds": None}

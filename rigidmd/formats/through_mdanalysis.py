@@ -25,7 +25,7 @@ import numpy as np
 
 from rigidmd.core.process import ignore_warnings, python_process
 from rigidmd.core.state import edges_and_angles
-from rigidmd.formats import Encode, Format, System, register
+from rigidmd.formats import Encode, Format, Placed, register
 from rigidmd.formats.atoms import Frame, structure_error
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def dimensions(cell: np.ndarray | None) -> list[float] | None:
     return None if cell is None or cell[0, 0] == inf else edges_and_angles(cell)
 
 
-def universe_of(system: System, *, velocities: bool = False) -> "mda.Universe":
+def universe_of(system: Placed, *, velocities: bool = False) -> "mda.Universe":
     """An MDAnalysis Universe of all sites, one residue per molecule, without bonds."""
     import MDAnalysis as mda
 
@@ -89,7 +89,7 @@ class FrameFiles:
 
     def __init__(
         self,
-        system: System,
+        system: Placed,
         *,
         velocities: bool,
         name: str,
@@ -200,7 +200,7 @@ def step_in_32_bits(step: int) -> int:
 XTC_MAGIC, MOST_PLAIN = 1995, 9
 
 
-def xtc_encoder(system: System, interval: float, velocities: bool) -> Encode:
+def xtc_encoder(system: Placed, interval: float, velocities: bool) -> Encode:
     """The same bytes as from MDAnalysis' writer, in half the time. For the few points of a body
     without MDAnalysis, which is slow to import."""
 
@@ -240,18 +240,18 @@ def _compressed_xtc(positions: np.ndarray, box: np.ndarray, step: int, time: flo
         return Path(path).read_bytes()
 
 
-def trr_encoder(system: System, interval: float, velocities: bool) -> Encode:
+def trr_encoder(system: Placed, interval: float, velocities: bool) -> Encode:
     files = FrameFiles(system, velocities=velocities, name="TRR")
     return lambda frame, k: files.content(frame._replace(step=step_in_32_bits(frame.step)))
 
 
-def dcd_encoder(system: System, interval: float, velocities: bool) -> Encode:
+def dcd_encoder(system: Placed, interval: float, velocities: bool) -> Encode:
     files = FrameFiles(system, velocities=velocities, name="DCD", options={"dt": interval})
     size = 80 + 12 * files.sites
     return lambda frame, k: files.content(frame)[0 if k == 0 else -size :]
 
 
-def netcdf_encoder(system: System, interval: float, velocities: bool) -> Encode:
+def netcdf_encoder(system: Placed, interval: float, velocities: bool) -> Encode:
     files = FrameFiles(
         system, velocities=velocities, name="NCDF", options={"velocities": velocities}
     )

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rigidmd.core.toml import parse_whole_number
-from rigidmd.formats import Encode, Format, System, register
+from rigidmd.formats import Encode, Format, Placed, register
 from rigidmd.formats.atoms import (
     HEAVY_HYDROGEN,
     Atoms,
@@ -150,7 +150,7 @@ def _columns(path: Path, line: int, comment: str) -> Columns:
     )
 
 
-def encoder(system: System, interval: float, velocities: bool) -> Encode:
+def encoder(system: Placed, interval: float, velocities: bool) -> Encode:
     """Extended XYZ, for OVITO and ASE: box and time are in the comment line."""
     files = FrameFiles(system, velocities=velocities, name="XYZ")
     # names of all sites, where elements do not name all that have mass

@@ -167,16 +167,6 @@ def read_columns(path: Path) -> Columns | None:
     return Columns(path, {header: [line[k] for line in lines] for k, header in enumerate(head)})
 
 
-def read_motion(path: Path) -> Columns | None:
-    """motion.csv as `read_columns`, its columns by their names in Python, as far as they are known;
-    of any version."""
-    columns_read = read_columns(path)
-    return columns_read and Columns(
-        path,
-        {samples.BODY_HEADERS.get(header, header): c for header, c in columns_read.cells.items()},
-    )
-
-
 def _lines(file: TextIO) -> Iterator[str]:
     """The complete lines of a file. Raises csv.Error for a line that is too long."""
     while line := file.readline(LONGEST_LINE):

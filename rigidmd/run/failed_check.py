@@ -13,6 +13,8 @@ from rigidmd.errors import SimulationError
 MIN_INERTIA_FRACTION = 0.01
 #: Rounding may change a potential energy by this fraction, half of its digits.
 ROUNDING = sqrt(np.finfo(float).eps)
+#: A larger relative error of the energy of a run without heat means that its motion is wrong.
+LARGE_ENERGY_ERROR = 1e-3
 
 
 class FailedCheck(SimulationError):

@@ -140,7 +140,7 @@ class RunLoop:
             stack.enter_context(signal_handler(self._stop_by_signal, *stop_signals()))
             self._bar = progress_of(
                 total,
-                part.time_unit,
+                part.scene.time_unit,
                 shown=progress if total > 0 else False,
                 spot=self._simulation._spot,
             )
@@ -296,7 +296,7 @@ class RunLoop:
         made_by = resume.provenance(
             simulation.scene, part.threads, part.record.inputs, part.engine_version
         )
-        results.summary = made_by | part.summary_of(results, self._preparing, wall)
+        results.summary = made_by | part.summary(results.samples, self._preparing, wall)
         for draws in (False, True):  # results first, pictures after
             noted = len(notes)
             for observer in self._observers.values():
@@ -332,7 +332,7 @@ class RunLoop:
         part = self._part
         time, origin = part.state.time
         step = int(part.state.step[ORIGIN]) + round((time - origin) / part.segment.dt)
-        where = f"stopped at step {step} ({time:g} {part.time_unit}): "
+        where = f"stopped at step {step} ({time:g} {part.scene.time_unit}): "
         if isinstance(error, OutputError):
             if isinstance(error, LostFileError):
                 with contextlib.suppress(OutputError):
@@ -545,7 +545,7 @@ class RunLoop:
                 return
             part = self._part
             self._simulation._note(
-                f"{name} failed at {part.state.time[NOW]:g} {part.time_unit}: {reason}"
+                f"{name} failed at {part.state.time[NOW]:g} {part.scene.time_unit}: {reason}"
             )
             self.interrupted, self._error = True, self._error or error
 

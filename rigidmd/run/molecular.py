@@ -85,12 +85,15 @@ REPLAYED = 20
 class MolecularRun(RunPart[System, MolecularRecord, Samples]):
     """The part of a simulation of molecules."""
 
-    time_unit = "ps"
     record_type = MolecularRecord
     summary_text, short_summary = staticmethod(summary_text), staticmethod(short_summary)
 
     def __init__(
-        self, simulation: "Simulation", scene: MolecularScene, forces: object, thermostat: object
+        self,
+        simulation: "Simulation",
+        scene: MolecularScene,
+        forces: object = None,
+        thermostat: object = None,
     ):
         super().__init__(simulation)
         user_forces = (
@@ -100,6 +103,10 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         if faults := rest_errors(self._start):
             raise SceneError(scene.source, faults)
         self.reset()
+
+    @property
+    def scene(self) -> MolecularScene:
+        return self.system.scene
 
     @property
     def threads(self) -> int:

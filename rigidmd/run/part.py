@@ -1,10 +1,9 @@
-"""The part of a simulation that depends on the kind of its system. `molecular` and `body` implement
-it."""
+"""The part of a simulation that depends on the kind of its scene."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Container
 from math import isclose
-from typing import TYPE_CHECKING, Generic, TypeVar, cast
+from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -21,27 +20,24 @@ from rigidmd.run.schedule import Segment
 
 if TYPE_CHECKING:
     from rigidmd.engines.observables import Observation
-    from rigidmd.engines.samples import Samples
-    from rigidmd.engines.system import System
-    from rigidmd.features.bodies.motion import Motion
-    from rigidmd.features.bodies.system import BodySystem, Pose
-    from rigidmd.run.results import Results
+    from rigidmd.engines.samples import SampleTable
+    from rigidmd.engines.sites import AnySystem
     from rigidmd.run.simulation import Simulation
+    from rigidmd.scene import OneScene
 
-SystemT = TypeVar("SystemT", "System", "BodySystem")
+
+SystemT = TypeVar("SystemT", bound="AnySystem")
 RecordT = TypeVar("RecordT", bound=RunRecord)
-SamplesT = TypeVar("SamplesT", "Samples", "Motion")
+SamplesT = TypeVar("SamplesT", bound="SampleTable")
 
 
 class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
     """What a `Simulation` moves: system, engine, state, the current segment, and the record of the
     run.
 
-    time_unit : "ps" or "s"
     record_type : a dataclass, the type of `record`
     """
 
-    time_unit: str
     record_type: type[RecordT]
     engine_version = "rigidmd"
 
@@ -57,13 +53,13 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
         self.lock = FairLock()
 
     @property
-    def scene(self):
+    def scene(self) -> "OneScene":
         """The scene as it runs."""
         return self.system.scene
 
     @property
     def threads(self) -> int:
-        """Number of threads. A single body has one."""
+        """Number of threads. Default: one."""
         return 1
 
     @property
@@ -97,20 +93,20 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
     # observation
 
     @abstractmethod
-    def observe(self, moment: Moment) -> "Observation | Pose":
+    def observe(self, moment: Moment) -> "Observation | NamedTuple":
         """The observation that `Moment.observation` keeps."""
 
     @abstractmethod
-    def observe_now(self) -> "Observation | Pose":
+    def observe_now(self) -> "Observation | NamedTuple":
         """The observation of the current state."""
 
     @abstractmethod
     def energy_now(self) -> float:
-        """Potential plus kinetic energy of the current state, kJ/mol, for a body J."""
+        """Potential plus kinetic energy of the current state, in the unit of the samples."""
 
     @abstractmethod
     def forces_now(self) -> np.ndarray:
-        """Forces (n, 3) at the current state, kJ/mol/Å, for a body N."""
+        """Forces (n, 3) at the current state, kJ/mol/Å or N."""
 
     @abstractmethod
     def default_observers(self) -> list[Observer]:
@@ -129,10 +125,6 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
         preparing : seconds of compiling and removal of overlaps
         wall : seconds of the run, with observers and output
         """
-
-    def summary_of(self, results: "Results", preparing: float, wall: float) -> Json:
-        """The summary of the results of this run."""
-        return self.summary(cast(SamplesT, results.samples), preparing, wall)
 
     @staticmethod
     @abstractmethod
@@ -154,8 +146,9 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
     ) -> Json:
         """Energies and forces at the start."""
 
+    @abstractmethod
     def take_threads(self, count: int) -> None:
-        """Set the number of threads. A single body always has one."""
+        """Set the number of threads."""
 
     @abstractmethod
     def start_from(self, state: State) -> None:
@@ -192,12 +185,11 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
                 f" {position.first}"
             )
         now, origin = state.time.tolist()
+        unit = self.scene.time_unit
         if not (isclose(origin, time, abs_tol=1e-6 * segment.dt) and position.time == time):
-            raise ValueError(
-                f"its stage began at {origin:g} {self.time_unit}, not at {time:g} {self.time_unit}"
-            )
+            raise ValueError(f"its stage began at {origin:g} {unit}, not at {time:g} {unit}")
         if now != origin + done * segment.dt:
-            raise ValueError(f"step {step[NOW]} is not at {now:g} {self.time_unit}")
+            raise ValueError(f"step {step[NOW]} is not at {now:g} {unit}")
 
     def is_replaced(self, moment: Moment) -> bool:
         """Whether the current moment is followed by another one of the same time."""

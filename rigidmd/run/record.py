@@ -1,35 +1,26 @@
-"""Reading of the folder of a run: its scene, its summary, and the columns of log.csv or
-motion.csv."""
+"""Reading of the folder of a run: its scene, its summary, and its samples."""
 
 import shlex
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 
-from rigidmd.assemble.build import build
-from rigidmd.core.state import State
 from rigidmd.core.toml import Json
 from rigidmd.engines import samples
-from rigidmd.engines.samples import BODY, BODY_COLUMNS
-from rigidmd.engines.system import System
-from rigidmd.errors import CheckpointError, OutputError
-from rigidmd.features.bodies.assemble import build_body
-from rigidmd.features.bodies.motion import Snapshot, motion
-from rigidmd.features.bodies.system import BodySystem
-from rigidmd.io.checkpoint import latest
-from rigidmd.io.folder import LOG, MOTION, SCENE, SUMMARY, check_is_run
-from rigidmd.io.run_files import Summary, read_columns, read_json, read_motion
-from rigidmd.scene import BodyScene, MolecularScene, Scene
-from rigidmd.scene.stage import Stage
+from rigidmd.errors import OutputError
+from rigidmd.io.folder import SCENE, SUMMARY, check_is_run
+from rigidmd.io.run_files import Summary, read_json
+from rigidmd.run.kind import kind_of
+from rigidmd.scene import Scene
 
-#: Header of a column of log.csv -> its name.
-HEADERS = {column.header: name for name, column in samples.IN_LOGS.items() if column.header}
+if TYPE_CHECKING:
+    from rigidmd.engines.sites import AnySystem
+    from rigidmd.engines.system import System
+    from rigidmd.scene import OneScene
 
-
-SystemT = TypeVar("SystemT", bound=System | BodySystem, covariant=True)
+SystemT = TypeVar("SystemT", bound="AnySystem", covariant=True)
 
 
 @dataclass(frozen=True)
@@ -42,19 +33,15 @@ class Record(Generic[SystemT]):
     """
 
     folder: Path
-    scene: MolecularScene | BodyScene
+    scene: "OneScene"
     system: SystemT
     summary: Json | None
     columns: dict[str, np.ndarray]
     missing: list[str]
 
     @property
-    def is_body(self) -> bool:
-        return isinstance(self.scene, BodyScene)
-
-    @property
     def time(self) -> np.ndarray:
-        """Times of the samples, ps for molecules, s for a body."""
+        """Times of the samples, in `time_unit`."""
         return self.columns["time"]
 
     @property
@@ -74,13 +61,6 @@ class Record(Generic[SystemT]):
         )
 
     @property
-    def moving(self) -> np.ndarray:
-        """Which samples (t,) are not of minimisations, in which no time passes."""
-        if isinstance(self.scene, BodyScene):
-            return np.ones(len(self.time), bool)
-        return samples.moving(self.scene.stages, self.columns["stage"])
-
-    @property
     def trajectory(self) -> Path:
         """Path of the trajectory. Raises OutputError if there is none."""
         name = self.scene.output.trajectory
@@ -94,7 +74,7 @@ class Record(Generic[SystemT]):
 
     @property
     def time_unit(self) -> str:
-        return "s" if self.is_body else "ps"
+        return self.scene.time_unit
 
 
 def read_record(folder: Path) -> Record:
@@ -110,99 +90,11 @@ def read_record(folder: Path) -> Record:
         missing.append(f"{ended}. These are its results so far; {resume}.")
     elif summary.interrupted:
         missing.append("This run was interrupted. These are its results so far.")
-    if isinstance(scene, BodyScene):
-        system = build_body(scene)
-        columns = _motion(folder, system, missing)
-    else:
-        system = build(scene, user_code=False)
-        columns = _log(folder, system)
+    kind = kind_of(scene)
+    system = kind.build(scene, user_code=False)
+    columns = kind.columns_of_run(folder, system, missing)
     if not columns or len(next(iter(columns.values()))) == 0:
         raise OutputError(f"{folder}: the run has not written samples yet. {resume}")
     return Record(
         folder, scene, system, summary and summary.model_dump(exclude_unset=True), columns, missing
     )
-
-
-def _log(folder: Path, system: System) -> dict[str, np.ndarray]:
-    """Columns of log.csv by their names in `results[...]`, with the index of the stage."""
-    read = read_columns(folder / LOG)
-    if read is None:
-        raise OutputError(f"{folder / LOG} cannot be read: there is no such file")
-    known = HEADERS | {column.header: name for name, column in system.more_columns.items()}
-    unit = samples.energy_column("").header
-    headers = {
-        known.get(header) or header.removesuffix(unit): header
-        for header in read.cells
-        if header in known or header.endswith(unit)
-    }
-    if lacking := [name for name in ("step", "time", "stage_name") if name not in headers]:
-        header = samples.COLUMNS[lacking[0]].header
-        raise OutputError(f"{read.path} is not a log of rigidmd: it has no column {header!r}")
-    columns = {
-        name: np.array(read.cells[header])
-        if name == "stage_name"
-        else read.numbers(header, finite=name == "time")
-        for name, header in headers.items()
-    }
-    return columns | {
-        "stage": _stage_of(columns["stage_name"], columns["time"], system.scene.stages)
-    }
-
-
-def _stage_of(names: np.ndarray, time: np.ndarray, stages: Sequence[Stage]) -> np.ndarray:
-    """Index of the stage of each row. Stages with the same name are distinguished by their
-    times."""
-    stage_of_row = np.full(len(names), len(stages) - 1)
-    first = 0
-    end = 0.0
-    for k, stage in enumerate(stages[:-1]):
-        end += stage.duration
-        of_stage = (names[first:] == stage.label) & (time[first:] <= end + 0.5 * stage.step)
-        count = len(of_stage) if of_stage.all() else int(of_stage.argmin())
-        stage_of_row[first : first + count] = k
-        first += count
-    return stage_of_row
-
-
-def _motion(folder: Path, system: BodySystem, missing: list[str]) -> dict[str, np.ndarray]:
-    """Columns of motion.csv, or, of a run that has not written it, of its last checkpoint."""
-    if (columns := read_motion(folder / MOTION)) is not None:
-        # that every motion has
-        families = [
-            "time",
-            "position",
-            "kinetic",
-            "potential",
-            "energy",
-            "work",
-        ]
-        if system.rotates:
-            families += [
-                "rotation",
-                "quaternion",
-                "euler_angles",
-                "omega_body",
-                "omega_lab",
-                "L_lab",
-            ]
-        needed = [name for family in families for name in BODY[family].names]
-        if lacking := [BODY_COLUMNS[name].header for name in needed if name not in columns.cells]:
-            raise OutputError(
-                f"{columns.path} is not the motion of this run: it has no column {lacking[0]!r}"
-            )
-        return {name: columns.numbers(name, finite=name in needed) for name in columns.cells}
-    try:
-        checkpoint, _ = latest(folder)
-    except CheckpointError:
-        return {}
-    for owner in checkpoint.values.get("of", {}):
-        part = checkpoint.of(owner).arrays
-        if "stacked/t" in part:  # of `run.body.Sampler`
-            states = zip(*(part[f"stacked/{name}"] for name in State._fields), strict=True)
-            times = part["stacked/t"].tolist()
-            snapshots = [Snapshot(t, State(*state)) for t, state in zip(times, states, strict=True)]
-            missing.append(
-                f"{MOTION} is written at the end. The motion shown ends at the last checkpoint."
-            )
-            return motion(system, snapshots).columns
-    return {}

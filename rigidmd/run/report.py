@@ -1,9 +1,9 @@
 """The summary of a run as text."""
 
-import math
 from collections.abc import Container, Sequence
 
 from rigidmd.core.statistics import NO_ERROR, format_signed, format_with_error
+from rigidmd.core.toml import Json
 
 POSITIONS = {
     "unwrapped": "molecules follow continuous paths",
@@ -21,13 +21,13 @@ def summary_text(summary: dict, known: Container[str] = ()) -> str:
         f" {summary['degrees_of_freedom_rotation']} rotation)"
     ]
     for stage in summary["stages"]:
-        lines += ["", stage_title(stage), *_as_lines(stage_rows(stage))]
+        lines += ["", stage_title(stage), *as_lines(stage_rows(stage))]
     momentum = (
         f"|P| = {summary['momentum_u_A_ps']:.1e} u Å/ps, {summary['momentum_relative']:.1e} of the"
         " sum of |m v|"
     )
     rows = [("precision", summary["precision_reason"])] if summary["precision_reason"] else []
-    rows += [_orthogonality(summary), ("momentum", momentum)]
+    rows += [orthogonality(summary), ("momentum", momentum)]
     for name, (calls, seconds) in summary.get("forces_by_python", {}).items():
         rows.append(("forces", f"{name}: {calls} calls, {seconds:.3g} s"))
     if removed := summary["momentum_removed"]:
@@ -42,21 +42,14 @@ def summary_text(summary: dict, known: Container[str] = ()) -> str:
         )
     if summary["positions"]:
         rows.append(("positions", f"{summary['positions']}: {POSITIONS[summary['positions']]}"))
-    return "\n".join([*lines, "", *_as_lines(rows), *_last_lines(summary, known)])
+    return "\n".join([*lines, "", *as_lines(rows), *last_lines(summary, known)])
 
 
-def body_summary_text(summary: dict, known: Container[str] = ()) -> str:
-    """The summary of a run of a single body as text, without the notes in `known`."""
-    return "\n".join(
-        [f"\n{body_title(summary)}", *_as_lines(body_rows(summary)), *_last_lines(summary, known)]
-    )
-
-
-def _as_lines(rows: list[tuple[str, str]]) -> list[str]:
+def as_lines(rows: list[tuple[str, str]]) -> list[str]:
     return [f"  {name:<16}{value}" for name, value in rows]
 
 
-def _last_lines(summary: dict, known: Container[str]) -> list[str]:
+def last_lines(summary: dict, known: Container[str]) -> list[str]:
     notes = [f"\n  note: {note}" for note in summary["notes"] if note not in known]
     return [
         *notes,
@@ -64,73 +57,9 @@ def _last_lines(summary: dict, known: Container[str]) -> list[str]:
     ]
 
 
-def _orthogonality(summary: dict) -> tuple[str, str]:
+def orthogonality(summary: dict) -> tuple[str, str]:
     error = summary["largest_orthogonality_error"]
     return "orthogonality", f"|QᵀQ - 1| at most {error:.1e}" if error else "exactly 0"
-
-
-def body_title(summary: dict) -> str:
-    """Steps and speed of a run of a single body."""
-    speed = f"; {summary['steps_per_s']:,.0f} steps/s" if summary["steps_per_s"] else ""
-    return (
-        f"{summary['steps']} steps of {summary['timestep_s']:g} s, {summary['duration_s']:g}"
-        f" s{speed}"
-    )
-
-
-#: Name of a rate of a body -> its name in reports, and how it is written with a number.
-RATES = {
-    "precession_rad_s": ("precession", "{} rad/s about the vertical"),
-    "precession_about_L_rad_s": ("precession", "{} rad/s about L"),
-    "nutation_period_s": ("nutation", "every {} s"),
-    "spin_rad_s": ("spin", "{} rad/s about the axis of symmetry"),
-    "omega_period_s": ("omega", "returns in the body every {} s"),
-    "flip_interval_s": ("flips", "every {} s"),
-}
-
-
-def _rate(rate: dict, pattern: str) -> str:
-    """A rate as measured and by theory."""
-    measured, theory = rate.get("measured"), rate.get("theory")
-    if measured is None:
-        theory = math.nan if theory is None else theory
-        return (
-            f"{pattern.format(f'{theory:.7g}')} in theory. Fewer than two periods in the samples,"
-            " or too few samples"
-        )
-    return pattern.format(f"{measured:.7g}") + (
-        "" if theory is None else f"; in theory {theory:.7g}"
-    )
-
-
-def body_rows(summary: dict) -> list[tuple[str, str]]:
-    """Names and values in the summary of a single-body run."""
-    rows = [
-        (
-            "energy",
-            (
-                f"{summary['energy_start_J']:.12g} J at the start, {summary['energy_end_J']:.12g} J"
-                " at the end"
-            ),
-        )
-    ]
-    if summary["work_J"]:
-        rows.append(("work", f"{summary['work_J']:.12g} J done on the body"))
-    if summary["theta_range_deg"]:
-        low, high = summary["theta_range_deg"]
-        rows.append(("theta", f"between {low:.6f}° and {high:.6f}°"))
-    rows += [
-        (RATES[name][0], _rate(rate, RATES[name][1]))
-        for name, rate in summary.get("rates", {}).items()
-        if name in RATES
-    ]
-    for name, error in summary["largest_relative_error"].items():
-        of = "the largest kinetic energy" if name == "energy" else "the largest |L|"
-        size = f"at most {error:.1e} of {of}" if error else "exactly 0"
-        rows.append((f"{name} error", size))
-    if summary["largest_orthogonality_error"] is not None:
-        rows.append(_orthogonality(summary))
-    return rows
 
 
 def stage_title(stage: dict) -> str:
@@ -284,3 +213,42 @@ def _temperatures(stage: dict, kind: str) -> str:
                 f"{name} {_with_error(value, stage[f'temperature_{motion}{kind}_error_K'], 2)}"
             )
     return f"{', '.join(texts)} K" if texts else ""
+
+
+def energy_lines(name: str, energies: Json, unit: str) -> list[str]:
+    """Energies of the start of molecules, of `MolecularRun.start_energy`, as text."""
+    steps = energies["overlap_removal_steps"]
+    removal = f", after {steps} steps of overlap removal" if steps else ""
+    lines = [f"{name}: energies of the start, {energies['molecules']} molecules{removal}"]
+    lines += [f"  {note}" for note in energies["notes"]]
+    rows = [(term.replace("_", " "), value, unit) for term, value in energies["components"].items()]
+    rows += [(key, energies[key], unit) for key in ("potential", "kinetic", "virial")]
+    if (lattice_energy := energies["lattice_energy_per_molecule"]) is None:
+        rows += [("per molecule", energies["potential_per_molecule"], f"{unit}, potential")]
+    else:
+        rows += [("lattice energy", lattice_energy, f"{unit} per molecule")]
+    rows += (
+        [] if energies["pressure_bar"] is None else [("pressure", energies["pressure_bar"], "bar")]
+    )
+    where = f"{unit}/Å on molecule {energies['largest_force_molecule']}"
+    rows.append(("largest force", energies["largest_force_per_A"], where))
+    lines += value_lines(rows, ">22.10g")
+    lines += [f"  {key.replace('_', ' ')}: {text}" for key, text in energies["meaning"].items()]
+    if error := energies.get("accuracy"):
+        lines.append(f"Coulomb forces on sites, compared with {error['reference']}")
+        relative = "" if error["relative"] is None else f"{error['relative']:.2g} of it, "
+        relative += f"{error['in_e2_per_A2']:.2g} e²/Å²"
+        rows = [
+            ("rms force", error["rms_force_per_A"], f"{unit}/Å"),
+            ("rms error", error["rms_error_per_A"], f"{unit}/Å: {relative}"),
+            ("estimated", error["estimated_per_A"], f"{unit}/Å"),
+            ("largest error", error["largest_error_per_A"], f"{unit}/Å"),
+            ("error of the energy", error["energy_error"], unit),
+        ]
+        lines += value_lines(rows, ">22.4g")
+    return lines
+
+
+def value_lines(rows: list[tuple[str, float, str]], form: str) -> list[str]:
+    """Lines with names, numbers and units."""
+    return [f"  {name:<22}{value:{form}} {unit}" for name, value, unit in rows]

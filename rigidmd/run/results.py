@@ -19,10 +19,9 @@ if TYPE_CHECKING:
     import MDAnalysis
     import pandas
 
-    from rigidmd.engines.samples import Samples
+    from rigidmd.engines.samples import SampleTable
+    from rigidmd.engines.sites import AnySystem
     from rigidmd.engines.system import System
-    from rigidmd.features.bodies.motion import Motion
-    from rigidmd.features.bodies.system import BodySystem
     from rigidmd.formats.atoms import Frame
 
 
@@ -46,9 +45,9 @@ class Results(Displayed):
         Number of the signal, 2 for Ctrl-C, 15 for SIGTERM
     """
 
-    system: "System | BodySystem"
+    system: "AnySystem"
     _state: State | None
-    samples: "Samples | Motion"
+    samples: "SampleTable"
     summary: Json = field(default_factory=dict)
     files: list[Path] = field(default_factory=list)
     interrupted: bool = False

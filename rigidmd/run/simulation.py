@@ -1,5 +1,4 @@
-"""The simulation of a scene, with molecules or a single body. Several of them at once in one
-process."""
+"""The simulation of a scene. Several of them at once in one process."""
 
 import atexit
 import contextlib
@@ -33,8 +32,10 @@ from rigidmd.errors import RigidMDError, RigidMDWarning, SceneError
 from rigidmd.io import folder as run_folder
 from rigidmd.io.progress import DisplayArea, announce, is_shown
 from rigidmd.io.scene_file import write_scene
+from rigidmd.run.kind import kind_of
 from rigidmd.run.loop import RunLoop
 from rigidmd.run.observers import as_observer
+from rigidmd.run.part import RunPart
 from rigidmd.run.results import Results
 from rigidmd.run.schedule import (
     checked_count,
@@ -43,19 +44,18 @@ from rigidmd.run.schedule import (
     signal_handler,
     stop_signals,
 )
-from rigidmd.scene import BodyScene, Scene
+from rigidmd.scene import Scene, is_molecular
 
 if TYPE_CHECKING:
     import ase
 
     from rigidmd.engines.observables import Observation
     from rigidmd.engines.protocol import Engine
+    from rigidmd.engines.sites import AnySystem
     from rigidmd.engines.system import System, TermMaker, ThermostatOfStages
-    from rigidmd.features.bodies.run import BodyRun
-    from rigidmd.features.bodies.system import BodySystem, Pose
     from rigidmd.run.minimise import OverlapRemoval
     from rigidmd.run.molecular import MolecularRun
-    from rigidmd.scene import MolecularScene
+    from rigidmd.scene import MolecularScene, OneScene
     from rigidmd.scene.molecules import UserForce
 
     AnyForce = UserForce | TermMaker | NamedTuple
@@ -70,7 +70,7 @@ if TYPE_CHECKING:
         walltime: float | None
         forces: AnyForce | Sequence[AnyForce] | None
         thermostat: NamedTuple | ThermostatOfStages | None
-        applied: Mapping[str, Callable[[Pose], tuple]] | None
+        applied: Mapping[str, Callable[..., tuple]] | None
 
 
 SystemT = TypeVar("SystemT")
@@ -152,7 +152,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
             print(simulation.state.time, simulation.energy)
     """
 
-    _part: "MolecularRun | BodyRun"
+    _part: RunPart
 
     if TYPE_CHECKING:
 
@@ -167,16 +167,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
 
         @overload
         def __init__(
-            self: "Simulation[BodySystem, BodyScene]",
-            scene: BodyScene,
-            folder: str | Path | None = None,
-            force: bool = False,
-            **options: Unpack[Options],
-        ) -> None: ...
-
-        @overload
-        def __init__(
-            self: "Simulation[System | BodySystem, MolecularScene | BodyScene]",
+            self: "Simulation[AnySystem, OneScene]",
             scene: Scene | str | Path,
             folder: str | Path | None = None,
             force: bool = False,
@@ -196,7 +187,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         walltime: float | None = None,
         forces: "AnyForce | Sequence[AnyForce] | None" = None,
         thermostat: "NamedTuple | ThermostatOfStages | None" = None,
-        applied: "Mapping[str, Callable[[Pose], tuple]] | None" = None,
+        applied: "Mapping[str, Callable[..., tuple]] | None" = None,
     ):
         scene = _as_scene(scene)
         # a callback may change the directory
@@ -218,25 +209,12 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         self._earlier: run_folder.RunMark | None = (
             None  # of the last run by this object in the folder
         )
-        of_molecules = {"forces": forces, "thermostat": thermostat}
-        if isinstance(scene, BodyScene):
-            from rigidmd.features.bodies.run import BodyRun
-
-            if set_keys := [key for key, value in of_molecules.items() if value is not None]:
-                problem = (
-                    f"{' and '.join(set_keys)}: for molecules. A single body takes applied={{name:"
-                    " function}"
-                )
-                raise SceneError(scene.source, [problem])
-            self._part = BodyRun(self, scene, applied)
-        else:
-            from rigidmd.run.molecular import MolecularRun
-
-            if applied is not None:
-                raise SceneError(
-                    scene.source, ["applied: for a single body. Molecules take forces=[...]"]
-                )
-            self._part = MolecularRun(self, cast("MolecularScene", scene), forces, thermostat)
+        given = {"forces": forces, "thermostat": thermostat, "applied": applied}
+        user_code = {key: value for key, value in given.items() if value is not None}
+        kind = kind_of(scene)
+        if refused := [key for key in user_code if key not in kind.takes]:
+            raise SceneError(scene.source, [f"{' and '.join(refused)}: {kind.takes_instead}"])
+        self._part = kind.run_part(self, scene, user_code)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self._summary_line}>"
@@ -286,7 +264,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         return self._part.state.read_only
 
     @property
-    def observation(self) -> "Observation | Pose":
+    def observation(self) -> "Observation | NamedTuple":
         """Observables of the current state, before, within and after a run. Each use evaluates the
         forces. Another thread waits for the steps that are being computed.
 
@@ -353,18 +331,20 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
 
     # Before a run.
 
-    def _before_run(self) -> "MolecularRun | BodyRun":
+    def _before_run(self) -> RunPart:
         """The part, which is changed before a run. Raises RuntimeError within a run."""
         if self._loop is not None:
             raise RuntimeError("the run has begun. close() ends it")
         return self._part
 
     def _molecules(self, *, begun: bool = False) -> "MolecularRun":
-        """The part of molecules. Raises TypeError for a body, RuntimeError within a run unless it
-        may have `begun`."""
+        """The part of molecules. Raises TypeError for other scenes, RuntimeError within a run
+        unless it may have `begun`."""
         part = self._part if begun else self._before_run()
-        if isinstance(part.scene, BodyScene):
-            raise TypeError(f"{part.scene.name} is a single body. This method is for molecules")
+        if not is_molecular(part.scene):
+            raise TypeError(
+                f"{part.scene.name} is {part.scene.subject}. This method is for molecules"
+            )
         return cast("MolecularRun", part)
 
     def start_from(self, state: State) -> None:
@@ -414,14 +394,13 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         self._part.reset()
 
     def _take_threads(self, count: int) -> None:
-        """Set the number of threads. Results do not depend on it. A single body always has one."""
+        """Set the number of threads. Results do not depend on it."""
         self._before_run().take_threads(count)
 
     def _start_energy(
         self, size: float = 1.0, unit: str = "J", *, measure_accuracy: bool = False
     ) -> Json:
-        """Energies and forces at the start. For the arguments see `MolecularRun.start_energy`, a
-        body has none."""
+        """Energies and forces at the start. For the arguments see `MolecularRun.start_energy`."""
         return self._before_run().start_energy(size, unit, measure_accuracy=measure_accuracy)
 
     # The run.

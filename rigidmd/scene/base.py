@@ -52,7 +52,7 @@ from rigidmd.scene.validation import (
 )
 
 if TYPE_CHECKING:
-    from rigidmd.scene import OneScene
+    from rigidmd.scene import BodyScene, MolecularScene, OneScene
 
 LONGEST_NAME = 100
 #: Largest number of characters of the name of a file. File systems allow 255, which temporary files
@@ -76,7 +76,7 @@ FOREIGN_INPUTS = {
     "Python": re.compile(r".*\.(py|ipynb)"),
 }
 PathName = str | os.PathLike
-AnyScene = TypeVar("AnyScene", bound="Scene")
+AnyScene = TypeVar("AnyScene", "MolecularScene", "BodyScene")
 
 
 class Scene(Section, Displayed):
@@ -87,6 +87,8 @@ class Scene(Section, Displayed):
     """The table that only scenes of this kind have"""
     subject: ClassVar[str] = ""
     """What moves, for messages"""
+    time_unit: ClassVar[str] = "ps"
+    """Unit of the times of a run, "ps" or "s\""""
 
     name: Annotated[str, Field(pattern=r"^[\w][\w.\-]*$", max_length=LONGEST_NAME)] = "scene"
     """Name of the run. Default: the name of the file"""

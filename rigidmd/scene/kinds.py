@@ -1,6 +1,7 @@
 """The kinds of scenes, molecules and those that features add, by the table that only they have."""
 
-from rigidmd.core.toml import Json
+from collections.abc import Mapping
+
 from rigidmd.features import FEATURES
 from rigidmd.scene.base import Scene
 
@@ -26,7 +27,7 @@ def scene_classes() -> list[type[Scene]]:
     ]
 
 
-def class_for(data: Json) -> type[Scene] | None:
+def class_for(data: Mapping[str, object]) -> type[Scene] | None:
     """The class of scenes with these tables. None if no table belongs to any kind. Raises
     MissingFeatureError."""
     for kind in (*ADDED, MOLECULES):

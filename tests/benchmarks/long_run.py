@@ -22,8 +22,9 @@ from command_line import SMOKE, new_parser, read_options
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from rigidmd import Scene, Simulation
 from rigidmd.core.integrators import SCHEMES
+from rigidmd.features.bodies.trials import body_trial_system
 from rigidmd.features.view.figures.style import FAINT, INK, curve_style, new_figure, open_axis
-from rigidmd.run.trial_systems import body_trial_system, molecular_trial_system
+from rigidmd.run.trial_systems import molecular_trial_system
 
 ROOT = Path(__file__).parents[2]
 SMOKE_STEPS = 4000

@@ -43,13 +43,13 @@ import pytest
 from pydantic import BaseModel
 from support.common import ROOT
 
-from rigidmd.assemble.scenes import resolve
 from rigidmd.commands import cli
 from rigidmd.commands.arguments import read_scene
 from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
 from rigidmd.core.shipped import CHAPTERS, DOCS, GUIDES, SECTIONS, find_example
 from rigidmd.errors import SceneError
 from rigidmd.formats import BY_EXTENSION
+from rigidmd.run.kind import resolve
 from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override
 from rigidmd.scene.models import read_parameters
 

@@ -69,7 +69,7 @@ def test_the_list_names_folders_their_needs_and_their_methods():
 
 
 #: Features without which the core does not work yet.
-ENTANGLED = ("bodies", "monte_carlo")
+ENTANGLED = ("monte_carlo",)
 
 
 @pytest.mark.parametrize(

@@ -40,10 +40,10 @@ TESTED_BY = {
     " features/bodies/forces/applied mechanics/translation",
     "features/bodies/test_fluid.py": "features/bodies/forces/resistance",
     "features/bodies/test_frames.py": "mechanics/time_functions",
-    "features/bodies/test_input.py": "features/bodies/keys/body features/bodies/keys/forces",
+    "features/bodies/test_input.py": "features/bodies/keys/body features/bodies/keys/forces features/bodies/describe",
     "features/bodies/test_ode.py": "features/bodies/ode/odes",
     "features/bodies/test_rates.py": "features/bodies/rates features/bodies/summary features/bodies/theory features/bodies/elliptic",
-    "features/bodies/test_run.py": "features/bodies/run",
+    "features/bodies/test_run.py": "features/bodies/run features/bodies/feature features/bodies/stored_motion features/bodies/stable_step",
     "features/calculators/test_ase_calculator.py": "run/atom_forces",
     "features/calculators/test_ase.py": "features/calculators/calculator",
     "features/crystals/test_cif.py": "features/crystals/cif_syntax features/crystals/crystal",
@@ -73,14 +73,15 @@ TESTED_BY = {
     "features/studies/sweep/test_sweeping.py": "features/studies/commands/compare features/studies/commands/sweep features/studies/compare"
     " features/studies/sweep/folder"
     " features/studies/sweep/replicas",
-    "features/studies/sweep/test_table.py": "features/studies/sweep/figure",
+    "features/studies/sweep/test_table.py": "features/bodies/study features/studies/kind_study features/studies/sweep/figure",
     "features/studies/test_normal_modes.py": "features/studies/commands/modes features/studies/gamma_point",
-    "features/view/test_animation.py": "features/view/commands/film features/view/commands/gallery features/view/commands/view"
+    "features/view/test_animation.py": "features/view/commands/film features/bodies/commands/gallery features/bodies/gallery features/view/commands/view"
     " features/bodies/animation features/view/molecule_animation features/view/page features/view/solids",
-    "features/view/test_figures.py": "features/analysis/curve_figure features/bodies/figures features/view/figures/panels"
+    "features/view/test_mesh.py": "features/bodies/edges",
+    "features/view/test_figures.py": "features/analysis/curve_figure features/bodies/figures features/view/figures/energy features/view/figures/panels"
     " features/view/figures/picture features/view/figures/space features/view/figures/style",
-    "features/view/test_notebook.py": "features/analysis/result core/display features/view/plots",
-    "features/view/test_run_page.py": "features/view/commands/report",
+    "features/view/test_notebook.py": "features/analysis/result features/bodies/display features/view/kind_display core/display features/view/plots",
+    "features/view/test_run_page.py": "features/view/commands/report features/view/stage_tables",
     "forces/ewald/test_direct_sum.py": "forces/ewald/smooth",
     "forces/neighbors/test_clusters.py": "forces/neighbors/tree",
     "forces/neighbors/test_pair_loop.py": "forces/neighbors/rows forces/neighbors/sites",
@@ -91,10 +92,10 @@ TESTED_BY = {
     "io/test_trajectory_file.py": "formats/through_mdanalysis io/structure_file",
     "run/test_checks.py": "assemble/harmonic run/failed_check run/rigid_fit run/stable_step",
     "run/test_observers.py": "run/molecular_observers",
-    "run/test_pilot.py": "run/trial_systems run/trials",
-    "run/test_resume.py": "commands/resume io/write run/record",
+    "run/test_pilot.py": "features/bodies/trials run/trial_systems run/trials",
+    "run/test_resume.py": "commands/resume io/write run/record run/stored_log",
     "run/test_results.py": "engines/observables",
-    "run/test_simulation.py": "engines/sites engines/system run/loop run/molecular run/part",
+    "run/test_simulation.py": "run/kind engines/sites engines/system run/loop run/molecular run/part",
     "run/test_summary.py": "run/report run/short_report",
     "scene/test_hints.py": "scene/base scene/kinds scene/stage",
     "scene/test_thermostats.py": "scene/ensemble_methods scene/ensembles",

@@ -14,9 +14,10 @@ from rigidmd.assemble.build import build
 from rigidmd.assemble.describe import describe
 from rigidmd.core.state import state_of
 from rigidmd.engines.cpu.engine import CpuEngine
+from rigidmd.engines.samples import moving
 from rigidmd.errors import RigidMDWarning, SceneError, SimulationError
 from rigidmd.features.studies.accuracy.accuracy import measure_accuracy
-from rigidmd.features.view.figures.panels import panels
+from rigidmd.features.view.kind_display import panels
 from rigidmd.features.view.run_page import write_report
 from rigidmd.io.trajectory import read_frames
 from rigidmd.run import Every, Simulation
@@ -323,7 +324,9 @@ def test_a_trajectory_has_one_frame_of_each_time(tmp_path, ending):
     assert found.time == pytest.approx(times, abs=1e-6)
     record = read_record(folder)
     assert list(record.columns["stage"]) == list(results["stage"])
-    assert list(np.unique(record.columns["stage"][record.moving])) == [2, 4]
+    assert list(
+        np.unique(record.columns["stage"][moving(record.scene.stages, record.columns["stage"])])
+    ) == [2, 4]
 
 
 @pytest.mark.parametrize("stopped_in", [0, 1, 3])
@@ -382,7 +385,7 @@ def test_a_minimum_alone_has_one_frame(tmp_path):
     write_report(tmp_path / "out", tmp_path / "report.html")
     record = read_record(tmp_path / "out")
     assert panels(record.system, record.columns) == []
-    assert not record.moving.any()
+    assert not moving(record.scene.stages, record.columns["stage"]).any()
 
 
 def test_structures_that_overlap_may_be_minimised(tmp_path):

@@ -13,13 +13,14 @@ from rigidmd.commands.cli import main
 from rigidmd.core.integrators import DRIFT, KICK, SCHEMES
 from rigidmd.engines.protocol import NotFiniteError
 from rigidmd.errors import SceneError, SimulationError
+from rigidmd.features.bodies.trials import fit_step
 from rigidmd.features.studies.accuracy.averages import measure_averages, start_of_last_stage
 from rigidmd.run import Simulation, trials
 from rigidmd.run.pilot import choice
 from rigidmd.run.pilot.choice import choose
 from rigidmd.run.pilot.energy_walk import EnergyWalk, weight
 from rigidmd.run.pilot.sampling import bias_of_potential, mean_square_rate
-from rigidmd.run.pilot.stages import _fit_step, choose_for_stage
+from rigidmd.run.pilot.stages import choose_for_stage
 from rigidmd.run.trials import Method, TrialSystem
 from rigidmd.scene import Scene
 
@@ -492,7 +493,7 @@ def test_the_estimated_bias_is_that_of_sampling_within_a_factor_of_two():
 def test_a_chosen_step_of_a_body_fits_its_duration_and_samples(
     timestep, duration, interval, wanted
 ):
-    found = _fit_step(timestep, duration, interval)
+    found = fit_step(timestep, duration, interval)
     assert found == pytest.approx(wanted, rel=1e-12)
     assert round(duration / found) * found == pytest.approx(duration, rel=1e-12)
     assert found <= timestep * (1 + 1e-9)

@@ -18,8 +18,10 @@ from support.stops import contents
 
 import rigidmd
 from rigidmd.engines.observables import Observation
-from rigidmd.engines.samples import BODY, BODY_COLUMNS, COLUMNS
+from rigidmd.engines.samples import COLUMNS
 from rigidmd.errors import OutputError, SceneError, StructureError
+from rigidmd.features.bodies.motion import COLUMNS as BODY_COLUMNS
+from rigidmd.features.bodies.motion import FAMILIES
 from rigidmd.io.run_files import TENSOR
 from rigidmd.run import Every, Simulation
 from rigidmd.scene import Scene
@@ -157,7 +159,9 @@ def test_every_column_of_every_body_is_in_the_table():
         )
         found |= set(results.units)
     assert found - {"Q"} <= set(BODY_COLUMNS)
-    assert {family for family, members in BODY.items() if not found & set(members.names)} == set()
+    assert {
+        family for family, members in FAMILIES.items() if not found & set(members.names)
+    } == set()
 
 
 def test_a_data_frame_has_the_headers_of_the_log(tmp_path):
@@ -271,7 +275,7 @@ HOVER = {
     "scene": "MolecularScene | BodyScene",
     "simulation": "Simulation",
     "simulation.state": "State",
-    'rigidmd.Simulation("water.toml").system': "System | BodySystem",
+    'rigidmd.Simulation("water.toml").system': "AnySystem",
     'rigidmd.Simulation("water.toml").scene': "MolecularScene | BodyScene",
     "results": "Results",
     'results["energy"]': "ndarray[",

@@ -1,7 +1,7 @@
 """Trials whose numbers are made up."""
 
+from rigidmd.features.bodies.trials import body_trial_system
 from rigidmd.features.studies.accuracy.measurement import IntegratorAccuracy
-from rigidmd.run.trial_systems import body_trial_system
 from rigidmd.run.trials import Trial
 from rigidmd.scene import Scene
 from support.common import ROOT

@@ -512,9 +512,9 @@ FRESH: list[Mutation] = [
     Mutation(
         "F58",
         "table of a sweep of bodies: lowest and highest values are exchanged",
-        "features/studies/sweep/table.py",
-        "        numbers = values.mean(), values.min(), values.max(), values[-1]",
-        "        numbers = values.mean(), values.max(), values.min(), values[-1]",
+        "features/bodies/study.py",
+        "            numbers = values.mean(), values.min(), values.max(), values[-1]",
+        "            numbers = values.mean(), values.max(), values.min(), values[-1]",
         ("features/studies/sweep/test_table.py::test_bodies_and_words",),
     ),
     Mutation(

@@ -7,7 +7,7 @@ arrays when a kernel returns that one is full, and raises exceptions for status 
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -67,11 +67,20 @@ class LastAdvance:
     )
 
 
+class HasRotor(Protocol):
+    """The constant part of a system, a NamedTuple."""
+
+    @property
+    def rotor(self) -> NamedTuple: ...
+    def _replace(self, *, rotor: NamedTuple) -> Self: ...
+
+
+ModelT = TypeVar("ModelT", bound=HasRotor)
 #: What an engine binds to a state and its load.
 Bound = TypeVar("Bound")
 
 
-class CompiledEngine(Engine, Generic[Bound]):
+class CompiledEngine(Engine, Generic[ModelT, Bound]):
     """An engine of compiled code.
 
     model : the constant part of the system
@@ -81,11 +90,11 @@ class CompiledEngine(Engine, Generic[Bound]):
     """
 
     is_repeatable = True
-    model: Any  # a NamedTuple with a rotor
+    model: ModelT
 
     def __init__(
         self,
-        model: Any,
+        model: ModelT,
         terms: dict[str, NamedTuple],
         setup: Setup,
         python_forces: dict[str, Callable] | None,
@@ -110,7 +119,7 @@ class CompiledEngine(Engine, Generic[Bound]):
         """Name of a term -> its present workspace. Empty before the first use."""
         return dict(zip(self.names, self._workspaces or (), strict=False))
 
-    def change(self, model: Any, terms: dict[str, NamedTuple]) -> None:
+    def change(self, model: ModelT, terms: dict[str, NamedTuple]) -> None:
         self.model, self.terms = model, terms
         self._workspaces = None
         self.forget()
@@ -168,7 +177,7 @@ class CompiledEngine(Engine, Generic[Bound]):
     def _new_dispatcher(self, use: str, workspaces: tuple[NamedTuple, ...]) -> TermDispatcher:
         return TermDispatcher(workspaces, USES[use], with_rates=use == "steps")
 
-    def model_for(self, scheme: Scheme) -> Any:
+    def model_for(self, scheme: Scheme) -> ModelT:
         """The model with the rotor of a scheme. The exact rotor differs only for asymmetric
         bodies."""
         rotor = self.model.rotor

@@ -32,7 +32,7 @@ BOX, EXTENSION = "box", "trajectory"
 DTYPES = {"double": np.float64, "mixed": np.float32}
 
 
-class CpuEngine(CompiledEngine[Advance]):
+class CpuEngine(CompiledEngine[Model, Advance]):
     """An engine of molecules. For the first arguments see `CompiledEngine`.
 
     precision : arithmetic between sites. "mixed": pairs in single precision, sums and motion in

@@ -21,7 +21,7 @@ from rigidmd.io.trajectory import Frames, read_frames, without_rounding
 from rigidmd.run.record import Record, read_record
 from rigidmd.run.results import Results
 from rigidmd.run.rigid_fit import Bodies, Kind, RigidFit, kinds_of
-from rigidmd.scene import MolecularScene
+from rigidmd.scene import MolecularScene, is_molecular
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.species import Molecules
 from rigidmd.scene.stage import Stage
@@ -287,8 +287,8 @@ def frames_of_folder(
 
     progress : called with the fraction done. Raises OutputError.
     """
-    if record.is_body:
-        what = "a run of a single body, and analyses are for molecules"
+    if not is_molecular(record.scene):
+        what = f"a run of {record.scene.subject}, and analyses are for molecules"
         raise OutputError(f"{record.folder} is {what}. `rigidmd report` shows it")
     system = record.system
     frame_limit = max(2, MOST_NUMBERS // (3 * system.site_count + 18 * len(system.model.species)))

@@ -10,6 +10,7 @@ from rigidmd.features.bodies.mesh import mesh_of
 from rigidmd.features.bodies.motion import drawn_axis
 from rigidmd.features.view.figures.space import UP, View, camera, globe, thin_path
 from rigidmd.features.view.figures.style import COOL, FAINT, INK, PALETTE, WARM
+from rigidmd.features.view.kind_display import Animation
 from rigidmd.features.view.page import PagePart, read_asset
 from rigidmd.mechanics.rotation import from_quaternion
 from rigidmd.run.record import Record
@@ -49,7 +50,7 @@ RETURN_ANGLE, RETURN_FRACTION = 0.03, 0.02
 EXACT_RETURN = 0.02
 
 
-class BodyAnimation:
+class BodyAnimation(Animation):
     """Lengths are in units of the picture's half width, about its centre. (t,) samples.
 
     position : (t, 3) of the pivot or the centre of mass

@@ -7,12 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.memory_check import check_memory_of_samples
-from rigidmd.assemble.plausibility import body_warnings
 from rigidmd.core.integrators import SCHEMES, SOLVERS
 from rigidmd.core.state import State, state_of
 from rigidmd.errors import SceneError
-from rigidmd.features.bodies.defaults import body_with_defaults
+from rigidmd.features.bodies.defaults import (
+    body_warnings,
+    body_with_defaults,
+    check_memory_of_samples,
+)
 from rigidmd.features.bodies.forces.applied import PythonForce, SteadyForce, TimeDependentForce
 from rigidmd.features.bodies.forces.resistance import NoResistance, Resistance
 from rigidmd.features.bodies.keys.body import SolidPart, axis_of_symmetry

@@ -13,7 +13,7 @@ from rigidmd.features.bodies.step_loop import LOADED, Body, FlowArrays, advance_
 from rigidmd.forces.terms import Setup
 
 
-class BodyEngine(CompiledEngine[tuple[FlowArrays, GradientWorkspace | None, np.ndarray]]):
+class BodyEngine(CompiledEngine[Body, tuple[FlowArrays, GradientWorkspace | None, np.ndarray]]):
     """An engine of a single body, which has no pairs and one thread. For the arguments see
     `CompiledEngine`."""
 

@@ -1,24 +1,14 @@
 """Figures of a single body: path of its axis, Euler angles, ellipsoids, path in space, errors of
 the invariants."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rigidmd.features.bodies.motion import Motion, drawn_axis
 from rigidmd.features.bodies.system import BodySystem
-from rigidmd.features.view.figures.panels import (
-    LABELS,
-    Panel,
-    Timeline,
-    angle_range,
-    body_panels,
-    draw_rows,
-    error_panel,
-    stack,
-    timeline,
-)
+from rigidmd.features.view.figures.panels import Panel, Timeline, draw_rows, stack
 from rigidmd.features.view.figures.space import (
     UP,
     View,
@@ -37,6 +27,10 @@ if TYPE_CHECKING:
 
     from rigidmd.features.view.figures.picture import Picture
 
+#: Errors of exactly 0 are drawn at this value.
+FLOOR = 1e-17
+#: Names of errors in legends.
+LABELS = {"L_lab_error": "L in the lab", "L_size_error": "|L|"}
 NOTE = {"loc": "left", "fontsize": 9, "color": FAINT}
 DASHED = (0, (5, 4))
 FIGURES = ("axis", "angles", "ellipsoids", "omega", "path", "invariants")
@@ -65,7 +59,7 @@ class _Figures:
         if gravity is not None and np.any(gravity.acceleration_m_s2):
             down = np.array(gravity.acceleration_m_s2)
             self.down = down / np.linalg.norm(down)
-        self.times = timeline(system, self.columns)
+        self.times = timeline(self.columns)
         self.panels = body_panels(system, self.columns)
 
     def stacked(self, *names: str) -> np.ndarray:
@@ -261,3 +255,74 @@ def _draw_plane(
 def _enlargement(factor: float) -> str:
     """An enlargement to two digits."""
     return f"×{float(f'{factor:.2g}'):,g}"
+
+
+def timeline(columns: Mapping[str, np.ndarray]) -> Timeline:
+    time = columns["time"]
+    return Timeline(np.ones(len(time), bool), time, np.zeros(len(time), int), "s")
+
+
+def body_panels(system: BodySystem, columns: Mapping[str, np.ndarray]) -> dict[str, list[Panel]]:
+    """Panels by what they show: angles, omega, position, energy, invariants."""
+    families: dict[str, list[Panel]] = {}
+    if "theta" in columns:
+        families["angles"] = _angle_panels(columns)
+    if "omega_body_1" in columns:
+        omega = [(f"ω{'₁₂₃'[k - 1]}", columns[f"omega_body_{k}"]) for k in (1, 2, 3)]
+        families["omega"] = [Panel("angular velocity in the body frame (rad/s)", omega)]
+    if system.translates:
+        position = np.stack([columns[key] for key in "xyz"])
+        least = 1e-11 * np.ptp(position, axis=1).max() + 1e-13 * np.abs(position).max()
+        families["position"] = [
+            Panel(f"{key} of the centre of mass (m)", [("", values)], least=least)
+            for key, values in zip("xyz", position, strict=True)
+            if np.ptp(position) > 0
+        ]
+    energies = [(name, columns[name]) for name in ("kinetic", "potential", "energy")]
+    families["energy"] = [Panel("energies (J)", energies)]
+    errors = [
+        (LABELS.get(name, name.removesuffix("_error")), np.abs(values))
+        for name, values in columns.items()
+        if name.endswith("_error") and np.isfinite(values).any()
+    ]
+    families["invariants"] = [error_panel(errors)] if errors else []
+    return families
+
+
+def error_panel(errors: list[tuple[str, np.ndarray]]) -> Panel:
+    """Relative errors of what is conserved, on a logarithmic axis."""
+    rounding = float(np.finfo(float).eps)
+    title = f"relative errors (dotted: rounding, {rounding:.1e}; 0 is drawn at {FLOOR:.0e})"
+    curves = [(label, np.maximum(error, FLOOR)) for label, error in errors]
+    return Panel(title, curves, log=True, level=rounding)
+
+
+def _angle_panels(columns: Mapping[str, np.ndarray]) -> list[Panel]:
+    """The Euler angles: φ and ψ continuous over full rotations."""
+    angles = {name: columns[name].copy() for name in ("phi", "theta", "psi")}
+    phi, theta, psi = angles.values()
+    # at θ = 0 or 180° only the sum or the difference of φ and ψ is defined: φ has its value in the
+    # next sample
+    for k in np.flatnonzero(np.sin(theta[:-1]) < 1e-12)[::-1]:
+        psi[k] += (phi[k] - phi[k + 1]) * np.sign(np.cos(theta[k]))
+        phi[k] = phi[k + 1]
+    found = []
+    for name, angle in zip("φθψ", (np.unwrap(phi), theta, np.unwrap(psi)), strict=True):
+        degrees = np.degrees(angle)
+        unit, size = ("turns", 360) if np.ptp(degrees) > 360 else ("°", 1)
+        change = angle_range(degrees)
+        if name != "θ" and np.ptp(degrees) > 1e-5:
+            first, last = np.round(degrees[[0, -1]], 6) + 0.0
+            change = f"from {first:.6g}° to {last:.6g}°, {(last - first) / 360:+.4g} turns"
+        found.append(Panel(f"{name} ({unit}), {change}", [("", degrees / size)], least=1e-5))
+    return found
+
+
+def angle_range(degrees: np.ndarray) -> str:
+    """A range of degrees as text, with enough digits to distinguish its ends."""
+    low, high = degrees.min(), degrees.max()
+    if high - low < 1e-5:
+        size = f" to {high - low:.0e}°" if high > low else ""
+        return f"{round(low, 6) + 0.0:.8g}°, constant{size}"
+    digits = int(np.clip(2 - np.floor(np.log10(high - low)), 1, 8))
+    return f"from {low:.{digits}f}° to {high:.{digits}f}°"

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.core.state import WORK, State
-from rigidmd.engines.samples import BODY, BODY_COLUMNS, MATRIX, Column, SampleTable
+from rigidmd.engines.samples import MATRIX, Column, SampleTable
 from rigidmd.features.bodies.forces.applied import (
     PythonForce,
     SteadyForce,
@@ -20,6 +20,73 @@ from rigidmd.mechanics.free_rotor import DrivenRotor
 from rigidmd.mechanics.rotation import to_euler_angles, to_quaternion, unit_vector
 from rigidmd.mechanics.time_functions import is_constant_function
 from rigidmd.mechanics.translation import FluidTranslation, InertialFrame, inertial_masses
+
+
+class Family(NamedTuple):
+    names: tuple[str, ...]
+    unit: str
+    about: str
+
+
+FAMILIES = {
+    "time": Family(("time",), "s", "time"),
+    "position": Family(("x", "y", "z"), "m", "centre of mass"),
+    "velocity": Family(("vx", "vy", "vz"), "m/s", "its velocity"),
+    "rotation": Family(
+        tuple(f"q{i}{j}" for i in "123" for j in "123"),
+        "1",
+        "rotation matrix Q by rows: lab = Q body",
+    ),
+    "quaternion": Family(
+        ("qw", "qx", "qy", "qz"), "1", "Q as a quaternion whose sign does not jump"
+    ),
+    "euler_angles": Family(("phi", "theta", "psi"), "rad", "Q as Euler angles, 3-1-3"),
+    "h_body": Family(
+        tuple(f"h_body_{k}" for k in (1, 2, 3)), "kg m²/s", "angular momentum of wheels, body axes"
+    ),
+    "omega_body": Family(
+        tuple(f"omega_body_{k}" for k in (1, 2, 3)), "rad/s", "angular velocity, body axes"
+    ),
+    "omega_lab": Family(
+        tuple(f"omega_lab_{k}" for k in "xyz"), "rad/s", "angular velocity, lab axes"
+    ),
+    "L_body": Family(
+        tuple(f"L_body_{k}" for k in (1, 2, 3)),
+        "kg m²/s",
+        "angular momentum with wheels, body axes",
+    ),
+    "L_lab": Family(
+        tuple(f"L_lab_{k}" for k in "xyz"), "kg m²/s", "angular momentum with wheels, lab axes"
+    ),
+    "kinetic": Family(
+        ("kinetic",), "J", "kinetic energy of I omega. Less Omega · J in a rotating frame"
+    ),
+    "potential": Family(("potential",), "J", "potential energy"),
+    "energy": Family(("energy",), "J", "kinetic and potential energy"),
+    "work": Family(("work",), "J", "work of drives and resistance: energy - work is conserved"),
+    "energy_error": Family(
+        ("energy_error",), "1", "change of energy - work, relative to the largest kinetic energy"
+    ),
+    "L_error": Family(
+        tuple(f"L_{k}_error" for k in ("lab", "size", *"xyz123")),
+        "1",
+        "change of L, relative to the largest abs(L)",
+    ),
+    "orthogonality_error": Family(("orthogonality_error",), "1", "largest entry of abs(QᵀQ - 1)"),
+}
+
+
+def _with_unit(name: str, unit: str) -> str:
+    """The header of a column of motion.csv, such as "phi (rad)". In ASCII, as the headers of
+    log.csv."""
+    return name if unit == "1" else f"{name} ({unit.replace('²', '^2')})"
+
+
+COLUMNS = {
+    n: Column(_with_unit(n, f.unit), f.unit, f.about) for f in FAMILIES.values() for n in f.names
+}
+#: Header of a column of motion.csv -> its name, also without units, as earlier versions wrote them.
+NAMES = {name: name for name in COLUMNS} | {"t": "time"} | {c.header: n for n, c in COLUMNS.items()}
 
 
 class Snapshot(NamedTuple):
@@ -43,8 +110,8 @@ class Motion(SampleTable):
     invariants: list[str]
 
     def __post_init__(self) -> None:
-        self.described = {name: BODY_COLUMNS[name] for name in self.columns}
-        if BODY["rotation"].names[0] in self.columns:
+        self.described = {name: COLUMNS[name] for name in self.columns}
+        if FAMILIES["rotation"].names[0] in self.columns:
             self.described[MATRIX] = Column(
                 "", "1", "the rotation matrices (n, 3, 3): lab = Q body"
             )
@@ -53,7 +120,7 @@ class Motion(SampleTable):
         """An array (t,) in SI units; of "Q", for a body that rotates, matrices (t, 3, 3)."""
         if name == MATRIX:
             return np.stack(
-                [self.columns[name] for name in BODY["rotation"].names], axis=-1
+                [self.columns[name] for name in FAMILIES["rotation"].names], axis=-1
             ).reshape(-1, 3, 3)
         return self.columns[name]
 
@@ -88,7 +155,7 @@ def motion(system: BodySystem, snapshots: list[Snapshot]) -> Motion:
 
 def _columns(family: str, values: np.ndarray) -> dict[str, np.ndarray]:
     """The columns of a family from values (t, n)."""
-    return dict(zip(BODY[family].names, values.T, strict=True))
+    return dict(zip(FAMILIES[family].names, values.T, strict=True))
 
 
 def _continuous(quaternions: np.ndarray) -> np.ndarray:

@@ -19,7 +19,8 @@ from rigidmd.errors import SimulationError, StructureError
 from rigidmd.features.bodies.assemble import build_body
 from rigidmd.features.bodies.forces.applied import SteadyForce
 from rigidmd.features.bodies.motion import Motion, Snapshot, energies, is_balanced, motion
-from rigidmd.features.bodies.summary import summarise_body
+from rigidmd.features.bodies.stable_step import fastest_rate, step_warnings
+from rigidmd.features.bodies.summary import summarise_body, summary_text
 from rigidmd.features.bodies.system import BodySystem, Pose
 from rigidmd.formats import format_of
 from rigidmd.io.checkpoint import Checkpoint
@@ -29,10 +30,8 @@ from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.run.failed_check import MIN_INERTIA_FRACTION, ROUNDING, FailedCheck
 from rigidmd.run.observers import Frames, Moment, Observer, SceneFile
 from rigidmd.run.part import RunPart
-from rigidmd.run.report import body_summary_text
 from rigidmd.run.resume import Arrays, NotNegative, RunRecord, check_same_scene, state_from
 from rigidmd.run.schedule import Segment, interruptible
-from rigidmd.run.stable_step import body_step_warnings, fastest_body_rate
 from rigidmd.scene import BodyScene
 from rigidmd.scene.validation import not_none, number_of_steps
 
@@ -243,21 +242,20 @@ class BodyRecord(RunRecord):
 class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
     """The part of a simulation of a single body."""
 
-    time_unit = "s"
     record_type = BodyRecord
-    summary_text = short_summary = staticmethod(body_summary_text)
+    summary_text = short_summary = staticmethod(summary_text)
 
     def __init__(
         self,
         simulation: "Simulation",
         scene: BodyScene,
-        applied: Mapping[str, Callable[[Pose], tuple]] | None,
+        applied: Mapping[str, Callable[[Pose], tuple]] | None = None,
     ):
         super().__init__(simulation)
         self._choice = None
         applied = dict(applied or {})
         if scene.run.is_auto:
-            from rigidmd.run.pilot.stages import choose_for_body
+            from rigidmd.features.bodies.trials import choose_for_body
 
             simulation._announce("choosing integrator and step by pilot runs")
             scene, self._choice = choose_for_body(scene, applied)
@@ -265,6 +263,13 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
         self._segments = self._equal_step_segments()
         self._given: dict[str, np.ndarray] = {}  # the state of `start_from`
         self.reset()
+
+    @property
+    def scene(self) -> BodyScene:
+        return self.system.scene
+
+    def take_threads(self, count: int) -> None:
+        """A body has one thread."""
 
     def start_from(self, state: State) -> None:
         if faults := self._scene_system.state_errors(state):
@@ -301,13 +306,13 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
                 " order 1. For friction and resistance use [friction] and [fluid], which keep"
                 " order 2. Otherwise integrator = 'dop853'"
             )
-        rate = fastest_body_rate(system)
+        rate = fastest_rate(system)
         angle = stable_angle(system.method)
         # some solvers choose their own steps
         if not self.scene.watch.stable_step or rate == 0 or angle == inf:
             return
         self.record.stable = angle / rate
-        for sentence in body_step_warnings(system):
+        for sentence in step_warnings(system):
             self.simulation._note(sentence)
 
     def durations(self) -> list[float]:

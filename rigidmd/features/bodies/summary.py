@@ -1,15 +1,17 @@
-"""The summary of a run of a single body: one dictionary with units in its keys, and its notes."""
+"""The summary of a run of a single body: one dictionary with units in its keys, its notes, and as
+text. The energies of the start as text."""
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Container, Iterable, Mapping
 
 import numpy as np
 
+from rigidmd.core.toml import Json
 from rigidmd.features.bodies.motion import Motion
 from rigidmd.features.bodies.rates import body_rates
 from rigidmd.features.bodies.system import BodySystem
-
-#: Larger relative errors of the energy of a body have a note: the motion is then wrong.
-LARGE_ENERGY_ERROR = 1e-3
+from rigidmd.run.failed_check import LARGE_ENERGY_ERROR
+from rigidmd.run.report import as_lines, last_lines, orthogonality, value_lines
 
 
 def summarise_body(
@@ -82,3 +84,87 @@ def motion_figures(columns: Mapping[str, np.ndarray], invariants: Iterable[str])
             None if theta is None else np.degrees([theta.min(), theta.max()]).tolist()
         ),
     }
+
+
+def summary_text(summary: dict, known: Container[str] = ()) -> str:
+    """The summary of a run of a single body as text, without the notes in `known`."""
+    return "\n".join(
+        [f"\n{title_of(summary)}", *as_lines(rows_of(summary)), *last_lines(summary, known)]
+    )
+
+
+def title_of(summary: dict) -> str:
+    """Steps and speed of a run of a single body."""
+    speed = f"; {summary['steps_per_s']:,.0f} steps/s" if summary["steps_per_s"] else ""
+    return (
+        f"{summary['steps']} steps of {summary['timestep_s']:g} s, {summary['duration_s']:g}"
+        f" s{speed}"
+    )
+
+
+#: Name of a rate of a body -> its name in reports, and how it is written with a number.
+RATES = {
+    "precession_rad_s": ("precession", "{} rad/s about the vertical"),
+    "precession_about_L_rad_s": ("precession", "{} rad/s about L"),
+    "nutation_period_s": ("nutation", "every {} s"),
+    "spin_rad_s": ("spin", "{} rad/s about the axis of symmetry"),
+    "omega_period_s": ("omega", "returns in the body every {} s"),
+    "flip_interval_s": ("flips", "every {} s"),
+}
+
+
+def _rate(rate: dict, pattern: str) -> str:
+    """A rate as measured and by theory."""
+    measured, theory = rate.get("measured"), rate.get("theory")
+    if measured is None:
+        theory = math.nan if theory is None else theory
+        return (
+            f"{pattern.format(f'{theory:.7g}')} in theory. Fewer than two periods in the samples,"
+            " or too few samples"
+        )
+    return pattern.format(f"{measured:.7g}") + (
+        "" if theory is None else f"; in theory {theory:.7g}"
+    )
+
+
+def rows_of(summary: dict) -> list[tuple[str, str]]:
+    """Names and values in the summary of a single-body run."""
+    rows = [
+        (
+            "energy",
+            (
+                f"{summary['energy_start_J']:.12g} J at the start, {summary['energy_end_J']:.12g} J"
+                " at the end"
+            ),
+        )
+    ]
+    if summary["work_J"]:
+        rows.append(("work", f"{summary['work_J']:.12g} J done on the body"))
+    if summary["theta_range_deg"]:
+        low, high = summary["theta_range_deg"]
+        rows.append(("theta", f"between {low:.6f}° and {high:.6f}°"))
+    rows += [
+        (RATES[name][0], _rate(rate, RATES[name][1]))
+        for name, rate in summary.get("rates", {}).items()
+        if name in RATES
+    ]
+    for name, error in summary["largest_relative_error"].items():
+        of = "the largest kinetic energy" if name == "energy" else "the largest |L|"
+        size = f"at most {error:.1e} of {of}" if error else "exactly 0"
+        rows.append((f"{name} error", size))
+    if summary["largest_orthogonality_error"] is not None:
+        rows.append(orthogonality(summary))
+    return rows
+
+
+def energy_lines(name: str, energies: Json) -> list[str]:
+    """Energies of the start, of `BodyRun.start_energy`, as text."""
+    rows = [(key, energies[key], "J") for key in ("kinetic", "potential", "energy")]
+    lines = [f"{name}: energy of the start", *value_lines(rows, ">22.15g")]
+    for key, what, unit in (
+        ("force_N", "force (lab)", "N"),
+        ("torque_body_N_m", "torque (body)", "N m"),
+    ):
+        if energies[key] is not None:
+            lines.append(f"  {what:<22}{' '.join(f'{x:>22.15g}' for x in energies[key])} {unit}")
+    return lines

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -12,7 +13,6 @@ from rigidmd.core.state_file import array_errors
 from rigidmd.engines.sites import Sites
 from rigidmd.errors import SimulationError
 from rigidmd.features.bodies.cpu_engine import BodyEngine
-from rigidmd.features.bodies.edges import edges_of
 from rigidmd.features.bodies.forces.resistance import NoResistance
 from rigidmd.features.bodies.keys.body import FORMULATION, SAMPLES
 from rigidmd.features.bodies.step_loop import Body
@@ -287,7 +287,7 @@ class BodySystem:
         """Å of the trajectory per metre."""
         return not_none(self.scene.output.trajectory_A_per_m)
 
-    @property
+    @cached_property
     def sites(self) -> Sites:
         n = len(self.points)
         names = np.array(self.point_names, dtype=object)
@@ -305,6 +305,8 @@ class BodySystem:
 
     def connections(self, *, massless: bool = False) -> np.ndarray:
         """Pairs (b, 2) of points that are joined, see `edges_of`."""
+        from rigidmd.features.bodies.edges import edges_of
+
         return edges_of(self)
 
     @property

@@ -43,7 +43,7 @@ from rigidmd.run.atom_forces import Form, ase_results
 from rigidmd.run.minimise import minimise
 from rigidmd.run.record import read_record
 from rigidmd.run.summary import describe_minimum, minimum_figures
-from rigidmd.scene import MolecularScene, Scene
+from rigidmd.scene import MolecularScene, Scene, is_molecular
 from rigidmd.scene.base import with_absolute_paths
 from rigidmd.scene.forces import Forces
 from rigidmd.scene.models import Molecule
@@ -129,8 +129,8 @@ class RigidMD(Calculator):
         species: str | Sequence[str | Mapping[str, object]] = []
         if not isinstance(models, Scene):
             species = models
-        elif not isinstance(models, MolecularScene):
-            faults.append(f"the scene {models.name} is of a single body, which has no atoms")
+        elif not is_molecular(models):
+            faults.append(f"the scene {models.name} is of {models.subject}, which has no atoms")
         elif given:
             faults.append(f"{', '.join(given)}: set by the scene. Change the scene")
         else:
@@ -509,8 +509,8 @@ def read_rigidmd(name: str, index: int | slice = -1) -> Atoms | list[Atoms]:
     """Frames of a run for `ase.io.read`. `name` is its folder, or the trajectory in it. Raises
     OutputError."""
     record = read_record(Path(name) if Path(name).is_dir() else Path(name).parent)
-    if record.is_body:
-        raise TypeError("this is a run of a single body, which has no atoms")
+    if not is_molecular(record.scene):
+        raise TypeError(f"this is a run of {record.scene.subject}, which has no atoms")
     found = read_frames(record.trajectory, record.system.site_count, most=1 << 60)
     arrays = [
         [None] * len(found.time) if a is None else a

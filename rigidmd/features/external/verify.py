@@ -31,7 +31,7 @@ from rigidmd.features.external.engines import (
 from rigidmd.io.folder import SCENE, check_folder, check_names, write_marker, written_by_runs
 from rigidmd.io.scene_file import input_names, write_scene
 from rigidmd.run import Simulation
-from rigidmd.scene import MolecularScene, Scene
+from rigidmd.scene import Scene, is_molecular
 from rigidmd.scene.engine import EngineChoice
 from rigidmd.scene.stage import Stage
 from rigidmd.units import FEMTOSECOND
@@ -51,9 +51,9 @@ def export(scene: Scene, to: str, folder: Path, force: bool = False) -> Exported
     """Write a scene for an external engine. It starts after overlap removal and the first
     minimisations. Raises SceneError with all that the engine cannot do, OutputError if the folder
     is in use."""
-    if not isinstance(scene, MolecularScene):
+    if not is_molecular(scene):
         raise SceneError(
-            scene.source, ["export supports molecules only, and this is a single body"]
+            scene.source, [f"export supports molecules only, and this is {scene.subject}"]
         )
     check_folder(folder, force=force, what="export", marker=MARKER)
     program = programs()[to]
@@ -147,9 +147,9 @@ def verify(scene: Scene) -> Verification:
     """Compare rigidmd with the engine that the scene names, both in double precision where that
     engine has it. Raises SceneError with all that the other engine cannot do, EngineError if it is
     not installed."""
-    if not isinstance(scene, MolecularScene):
+    if not is_molecular(scene):
         raise SceneError(
-            scene.source, ["a single body has no other engine: verify is for molecules"]
+            scene.source, [f"{scene.subject} has no other engine: verify is for molecules"]
         )
     if not scene.engine.is_external:
         raise SceneError(

@@ -24,7 +24,7 @@ from rigidmd.features.free_energy.mean_force import (
 from rigidmd.features.studies.sweep.folder import SEED, Manifest, read_manifest
 from rigidmd.features.studies.sweep.table import Table
 from rigidmd.run.record import Record, read_record
-from rigidmd.scene import MolecularScene
+from rigidmd.scene import is_molecular
 from rigidmd.scene.stage import Stage
 from rigidmd.scene.validation import not_none
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
@@ -98,8 +98,8 @@ def production_of(folder: Path) -> tuple[Record[System], Stage, np.ndarray]:
     """A run of molecules, its last stage and which samples are of production. Raises
     OutputError."""
     record = read_record(folder)
-    if not isinstance(record.scene, MolecularScene):
-        raise OutputError(f"{folder} is a run of a single body, which has no molecules")
+    if not is_molecular(record.scene):
+        raise OutputError(f"{folder} is a run of {record.scene.subject}, which has no molecules")
     return record, *production_samples(record)
 
 

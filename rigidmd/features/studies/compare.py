@@ -13,9 +13,10 @@ from rigidmd.core.state import State
 from rigidmd.core.state_file import read_state
 from rigidmd.core.toml import Json, read_toml
 from rigidmd.errors import OutputError, RigidMDError, SceneError
-from rigidmd.io.folder import FINAL, LOG, MOTION, SCENE, SUMMARY, check_is_run
-from rigidmd.io.run_files import Columns, Summary, read_columns, read_json, read_motion
+from rigidmd.io.folder import FINAL, SCENE, SUMMARY, check_is_run
+from rigidmd.io.run_files import Columns, Summary, read_json
 from rigidmd.io.write import columns_text
+from rigidmd.run.kind import Molecules, kinds
 from rigidmd.run.resume import MADE_WITH, differences, keys_of
 
 #: Columns by which samples are matched: steps if they have the same times in both files, else
@@ -120,8 +121,9 @@ def compare(first: Path, second: Path) -> RunComparison:
                 | {f"file of {key}": sha[:12] for key, sha in there.get("input_sha256", {}).items()}
             )
         found.made = differences(made[0], made[1], "not recorded")
-    for name, read in ((LOG, read_columns), (MOTION, read_motion)):
-        if either(name) and (tables := both(name, read)):
+    for kind in kinds():
+        name = kind.samples_file
+        if either(name) and (tables := both(name, kind.read_samples)):
             found.samples = _compare_samples(name, *tables)
     if either(FINAL) and (saved := both(FINAL, read_state)):
         for name, a, b in zip(State._fields, *(of.state for of in saved), strict=True):
@@ -230,7 +232,7 @@ def describe_run_comparison(found: RunComparison) -> str:
         )
     elif (
         found.samples is not None
-        and found.samples.file == LOG
+        and found.samples.file == Molecules.samples_file
         and not any(FINAL in text for text in found.missing)
     ):
         rows.append((FINAL, ["the same to the last bit"]))

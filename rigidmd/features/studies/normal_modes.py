@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import pi, prod
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, eigsh
@@ -31,9 +31,12 @@ from rigidmd.run.minimise import Enthalpy
 from rigidmd.run.minimise import minimise as find_minimum
 from rigidmd.run.schedule import checked_count
 from rigidmd.run.stable_step import stiffest_mode
-from rigidmd.scene import BodyScene, MolecularScene
+from rigidmd.scene import MolecularScene, Scene, is_molecular
 from rigidmd.scene.stage import Stage
 from rigidmd.units import AVOGADRO, BOLTZMANN, COULOMB, FEMTOSECOND, KJ_PER_MOL
+
+if TYPE_CHECKING:
+    from rigidmd.scene import OneScene
 
 #: Displacement of a difference, in smallest diameters: its error and that of rounding are 1e-10 of
 #: the largest entry.
@@ -205,7 +208,7 @@ class NormalModes:
 
 
 def normal_modes(
-    scene: MolecularScene | BodyScene | Simulation,
+    scene: Scene | Simulation,
     *,
     minimise: bool = True,
     count: int | None = None,
@@ -247,10 +250,10 @@ def normal_modes(
     """
     count = None if count is None else checked_count(count, "count")
     simulation = scene if isinstance(scene, Simulation) else Simulation(scene)
-    if isinstance(simulation.scene, BodyScene):
+    if not is_molecular(simulation.scene):
         raise SceneError(
             simulation.scene.source,
-            ["normal modes need a molecular scene, and this is a single body"],
+            [f"normal modes need a molecular scene, and this is {simulation.scene.subject}"],
         )
     state = (simulation.state if simulation is scene else simulation._settle()).copy()
     system = cast(System, simulation.system)
@@ -440,7 +443,7 @@ def _outer_modes(c: Coordinates, count: int) -> tuple[np.ndarray, np.ndarray, np
     )
 
 
-def animation_files(scene: MolecularScene | BodyScene) -> list[str]:
+def animation_files(scene: "OneScene") -> list[str]:
     """Names of the files of `write_animation`. Raises SceneError without a trajectory."""
     output = scene.output
     if not output.trajectory:

@@ -8,12 +8,12 @@ from typing import overload
 from rigidmd.core.state import State
 from rigidmd.core.state_file import read_state
 from rigidmd.errors import CheckpointError, StructureError
-from rigidmd.features.bodies.motion import Motion
 from rigidmd.features.studies.sweep.folder import read_manifest
 from rigidmd.features.studies.sweep.table import Table, table_of
 from rigidmd.formats.atoms import Frame
 from rigidmd.io.checkpoint import latest
 from rigidmd.io.folder import FINAL, SWEEP, written_by_runs
+from rigidmd.run.kind import kind_of
 from rigidmd.run.record import Record, read_record
 from rigidmd.run.results import Results
 from rigidmd.run.resume import state_from
@@ -55,11 +55,7 @@ def _results_of(record: Record) -> Results:
     notes = [*record.missing, *summary["notes"], *([problem] if problem else [])]
     written = summary.get("files", written_by_runs(record.folder))
     names = dict.fromkeys(Path(name).name for name in written)  # the folder may have been moved
-    if record.is_body:
-        errors = [name.removesuffix("_error") for name in record.columns if name.endswith("_error")]
-        samples = Motion(record.columns, [name for name in errors if name != "orthogonality"])
-    else:
-        samples = record.log
+    samples = kind_of(record.scene).samples_of(record)
     results = Results(record.system, state, samples, summary | {"notes": notes})
     results.files = [path for name in names if (path := record.folder / name).is_file()]
     results.interrupted, results._is_stored, results._no_state = (

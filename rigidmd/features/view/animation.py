@@ -15,11 +15,9 @@ import numpy as np
 
 from rigidmd.core.files import atomic_file
 from rigidmd.errors import OutputError
-from rigidmd.features.bodies.animation import BodyAnimation
-from rigidmd.features.view.figures.panels import draw_rows, panels, timeline
+from rigidmd.features.view.figures.panels import draw_rows
 from rigidmd.features.view.figures.style import COLORS, INK, WARM, new_figure
-from rigidmd.features.view.molecule_animation import MoleculeAnimation
-from rigidmd.features.view.run_page import animation_of
+from rigidmd.features.view.kind_display import Animation, display_of, panels, timeline
 from rigidmd.run.record import Record, read_record
 from rigidmd.scene.validation import not_none
 
@@ -83,7 +81,7 @@ def write_film(
         advice = "install the program, or `pip install imageio-ffmpeg`, which contains it"
         raise OutputError(f"{path}: .mp4 needs ffmpeg: {advice}. A .gif needs no other program")
     record = read_record(folder)
-    animation = animation_of(record, MOST_FRAMES)
+    animation = display_of(record.scene).animation(record, MOST_FRAMES)
     begin, (end, notes) = float(animation.time[0]), animation.loop_end()
     count = max(2, round(seconds * RATE[kind]))
     times = np.linspace(begin, end, count)
@@ -114,7 +112,7 @@ def _pixels(figure: "Picture") -> np.ndarray:
 
 def _frames(
     record: Record,
-    animation: BodyAnimation | MoleculeAnimation,
+    animation: Animation,
     times: np.ndarray,
     pixels: int,
     *,

@@ -2,6 +2,7 @@
 Matplotlib."""
 
 import html
+from dataclasses import replace
 from importlib.resources import files
 from itertools import product
 from typing import TYPE_CHECKING
@@ -13,12 +14,14 @@ from rigidmd.engines.sites import Sites
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError
 from rigidmd.features.view.figures.space import View, camera
+from rigidmd.features.view.kind_display import Animation
 from rigidmd.features.view.molecule_figure import color_of
 from rigidmd.features.view.page import PagePart, read_asset
 from rigidmd.features.view.solids import DEFAULT_RADIUS, SPHERE_SCALE, solids_of
 from rigidmd.formats.bonds import COVALENT, connections
 from rigidmd.io.trajectory import Frames, read_frames
 from rigidmd.run.record import Record
+from rigidmd.run.results import Results
 from rigidmd.run.rigid_fit import RigidFit
 from rigidmd.scene.validation import not_none
 
@@ -27,6 +30,8 @@ if TYPE_CHECKING:
 
 #: Most coordinates in a page, of 2 bytes each: with base64 about 21 MB, plus 3 MB of chemiscope.
 MOST_COORDINATES = 8_000_000
+#: Maximum number of coordinates in a notebook.
+NOTEBOOK_COORDINATES = 1_500_000
 #: The JavaScript of chemiscope inside its package.
 SCRIPT = ("sphinx", "static", "chemiscope.min.js")
 #: Largest rounding error of a distance within a molecule in a trajectory, Å.
@@ -105,7 +110,7 @@ def massive_bonds(system: System) -> list[list[int]]:
     return [[int(i), int(j), 1] for i, j in number[connections(system)]]
 
 
-class MoleculeAnimation:
+class MoleculeAnimation(Animation):
     """Molecules at the times of a trajectory: lit spheres in the box, distant ones paler, and a
     scale."""
 
@@ -212,3 +217,24 @@ class MoleculeAnimation:
         legend = ", ".join(f"{k} {m.name}" for k, m in zip(count, molecules.species, strict=True))
         scripts = [code, read_asset("film.js"), read_asset("molecules.js")]
         return PagePart(PICTURE, html.escape(legend), USAGE, data, scripts)
+
+
+def frames_in_memory(results: Results, system: System, record: Record) -> Frames:
+    """The frames of a run for a notebook, from its files or from memory. Raises OutputError."""
+    if not system.scene.output.trajectory or not results._frames:
+        raise OutputError("this run has no frames (output.trajectory = false)")
+    most = max(2, NOTEBOOK_COORDINATES // (3 * len(system.sites.mass)))
+    if results.files:
+        return frames_of(replace(record, folder=results.files[0].parent), most)
+    count = len(results._frames)
+    stride = max(1, -(-count // most))
+    chosen = results._frames[::stride]
+    frames = Frames(
+        time=np.array([frame.time for frame in chosen]),
+        positions=np.array([frame.positions for frame in chosen]),
+        cells=np.array([frame.cell for frame in chosen]) if system.density else None,
+        count=count,
+        stride=stride,
+        is_cut=False,
+    )
+    return inside(frames, system.sites)

@@ -2,35 +2,20 @@
 in a notebook."""
 
 import html
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from rigidmd.assemble.describe import describe, describe_system
 from rigidmd.core.display import html as html_of
 from rigidmd.core.files import write_text
-from rigidmd.engines.system import System
 from rigidmd.errors import InputError, OutputError
-from rigidmd.features.bodies.animation import BodyAnimation
-from rigidmd.features.bodies.system import BodySystem
-from rigidmd.features.view.figures.run import run_figures
-from rigidmd.features.view.molecule_animation import (
-    MoleculeAnimation,
-    chemiscope_script,
-    frames_of,
-    inside,
-)
+from rigidmd.features.view.kind_display import display_of
 from rigidmd.features.view.page import Raw, code, figure, items, notes, page, read_asset, table
 from rigidmd.features.view.plots import record_of
 from rigidmd.features.view.run_page import FILM_STYLE, animation_parts
-from rigidmd.io.trajectory import Frames
-from rigidmd.run.record import Record
-from rigidmd.run.report import body_rows, body_title, stage_rows, stage_title
+from rigidmd.run.kind import describe, kind_of
 from rigidmd.run.results import Results
 from rigidmd.run.simulation import Simulation
-from rigidmd.scene import BodyScene, MolecularScene, Scene
+from rigidmd.scene import Scene
 
 if TYPE_CHECKING:
     from rigidmd.features.view.figures.picture import Picture
@@ -40,12 +25,11 @@ STYLE = read_asset("notebook.css")
 
 @html_of.register
 def scene_html(scene: Scene) -> str:
-    kind = "one rigid body" if isinstance(scene, BodyScene) else "rigid molecules"
     try:
-        text = code(describe(cast("MolecularScene | BodyScene", scene), user_code=False))
+        text = code(describe(scene, user_code=False))
     except InputError as error:
         text = f"<p>{html.escape(scene.in_short)}</p>{items(error.errors)}"
-    return framed(scene.name, kind, text)
+    return framed(scene.name, display_of(scene).title, text)
 
 
 @html_of.register
@@ -55,7 +39,8 @@ def simulation_html(simulation: Simulation) -> str:
     rows = [("threads", str(simulation.threads)), ("writes to", where)]
     if names := [type(observer).__name__ for observer in simulation._observers]:
         rows.append(("observers", ", ".join(names)))
-    text = code(describe_system(simulation.system)) + table([], rows, words=True)
+    described = kind_of(simulation.scene).describe(simulation.system)
+    text = code(described) + table([], rows, words=True)
     return framed(simulation.scene.name, "ready to run: run() does it", text)
 
 
@@ -63,14 +48,13 @@ def simulation_html(simulation: Simulation) -> str:
 def results_html(results: Results) -> str:
     summary = results.summary
     name = results.system.scene.name
-    if isinstance(results.system, BodySystem):
-        # "steps": not of a run that has not ended
-        parts = [(body_title(summary), body_rows(summary))] if "steps" in summary else []
-    else:
-        parts = [(stage_title(stage), stage_rows(stage)) for stage in summary["stages"]]
-    text = [f"<p>{html.escape(title)}</p>{table([], rows, words=True)}" for title, rows in parts]
+    display = display_of(results.system.scene)
+    text = [
+        f"<p>{html.escape(title)}</p>{table([], rows, words=True)}"
+        for title, rows in display.tables(summary)
+    ]
     stem, drawn = next(
-        iter(run_figures(results.system, results.samples, summary).items()), ("", None)
+        iter(display.figures(results.system, results.samples, summary).items()), ("", None)
     )
     left = f"{''.join(text)}{notes(summary['notes'])}"
     right = drawing_of(drawn, f"{name}-{stem}", f"figure: {stem}")
@@ -111,8 +95,6 @@ def _columns(results: Results) -> str:
     return f"<details><summary>{title}</summary>{listed}</details>"
 
 
-#: Maximum number of coordinates in a notebook.
-MOST_COORDINATES = 1_500_000
 #: Height of a frame, pixels.
 HEIGHT = 720
 
@@ -149,33 +131,8 @@ def show(results: Results) -> AnimationPage:
     system = results.system
     record = record_of(system, results.samples, results.summary)
     try:
-        if isinstance(system, BodySystem):
-            animation = BodyAnimation(record)
-        else:
-            chemiscope_script()
-            animation = MoleculeAnimation(record, frames=_frames(results, system, record))
+        animation = display_of(system.scene).animation_in_memory(results, record)
     except OutputError as error:
         kind = ImportError if "chemiscope" in str(error) else ValueError
         raise kind(str(error)) from None
     return AnimationPage(page(record.scene.name, animation_parts(record, animation), FILM_STYLE))
-
-
-def _frames(results: Results, system: System, record: Record) -> Frames:
-    """The frames of a run, from its files or from memory."""
-    if not system.scene.output.trajectory or not results._frames:
-        raise OutputError("this run has no frames (output.trajectory = false)")
-    most = max(2, MOST_COORDINATES // (3 * len(system.sites.mass)))
-    if results.files:
-        return frames_of(replace(record, folder=results.files[0].parent), most)
-    count = len(results._frames)
-    stride = max(1, -(-count // most))
-    chosen = results._frames[::stride]
-    frames = Frames(
-        time=np.array([frame.time for frame in chosen]),
-        positions=np.array([frame.positions for frame in chosen]),
-        cells=np.array([frame.cell for frame in chosen]) if system.density else None,
-        count=count,
-        stride=stride,
-        is_cut=False,
-    )
-    return inside(frames, system.sites)

@@ -2,29 +2,25 @@
 live ones."""
 
 import time as clock
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
 from rigidmd.core.toml import Json
-from rigidmd.engines.samples import BODY_COLUMNS, MATRIX, Column, Samples
-from rigidmd.engines.system import System
-from rigidmd.features.bodies.motion import Motion
-from rigidmd.features.bodies.system import BodySystem
-from rigidmd.features.view.figures.panels import Panel, draw_rows, panels, stack, timeline
+from rigidmd.engines.samples import MATRIX, Column, SampleTable
+from rigidmd.engines.sites import AnySystem
+from rigidmd.features.view.figures.panels import Panel, draw_rows, stack
 from rigidmd.features.view.figures.picture import Picture
-from rigidmd.features.view.figures.run import run_figures
 from rigidmd.features.view.figures.style import new_figure
+from rigidmd.features.view.kind_display import display_of, panels, run_figures, timeline
 from rigidmd.features.view.page import figure as figure_part
 from rigidmd.io.progress import DisplayArea, in_notebook
 from rigidmd.run.observers import Moment, Observer
 from rigidmd.run.record import Record
 from rigidmd.run.results import Results
 from rigidmd.run.simulation import Simulation
-from rigidmd.scene import BodyScene, MolecularScene
-from rigidmd.scene.validation import did_you_mean, not_none
+from rigidmd.scene.validation import did_you_mean
 
 #: Inches: narrow, to be readable on a phone.
 WIDTH, HEIGHT = 4.4, 2.3
@@ -47,8 +43,8 @@ def plots_part(record: Record) -> str:
 
 
 def record_of(
-    system: System | BodySystem,
-    samples: Samples | Motion,
+    system: AnySystem,
+    samples: SampleTable,
     summary: Json | None,
     names: Sequence[str] | None = None,
 ) -> Record:
@@ -86,7 +82,7 @@ def plot(results: Results, *columns: str, log: bool = False) -> Picture:
 
 
 def check_names(
-    names: Sequence[str], described: dict[str, Column], figures: Iterable[str] = ()
+    names: Sequence[str], described: Mapping[str, Column], figures: Iterable[str] = ()
 ) -> None:
     """Raise KeyError, with a suggestion, for a name that is not a column of numbers."""
     known = [name for name, column in described.items() if column.unit and name != MATRIX]
@@ -116,8 +112,6 @@ def columns_figure(
     return stack(rows, record.scene.name)
 
 
-#: Default columns; for a body the first one that it has.
-MOLECULES, BODY = ("temperature", "drift"), ("energy_error", "energy")
 #: Drawing takes at most this fraction of the time of a run.
 TIME_FRACTION = 0.2
 
@@ -152,13 +146,7 @@ class LivePlot(Observer):
             For an unknown column.
         """
         self._run, self._due = run, 0.0
-        scene = cast(MolecularScene | BodyScene, run.scene)
-        if isinstance(scene, BodyScene):
-            described = BODY_COLUMNS
-            every = not_none(scene.output.interval_s)
-        else:
-            described = run._part.samples().described
-            every = scene.output.log_interval_ps
+        described, every = display_of(run.scene).live_samples(run)
         self.interval = every if self._asked is None else self._asked
         check_names(self._columns, described)
         self._spot = DisplayArea() if in_notebook() else None
@@ -182,9 +170,7 @@ class LivePlot(Observer):
         if len(samples) < 2:
             return
         described = samples.described
-        names = self._columns or MOLECULES
-        if not self._columns and "drift" not in described:
-            names = [name for name in BODY if name in described][:1]
+        names = self._columns or display_of(self._run.scene).live_columns(described)
         check_names(names, described)
         record = record_of(self._run.system, samples, None, names)
         png, size = columns_figure(record, names, described).png()

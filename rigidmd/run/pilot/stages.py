@@ -1,21 +1,16 @@
-"""`integrator = "auto"`: the integrator and the step of a stage, or of a single body."""
+"""`integrator = "auto"`: the integrator and the step of a stage."""
 
-from collections.abc import Callable
-from fractions import Fraction
 from importlib import import_module
-from math import ceil, gcd, inf, sqrt
+from math import inf, sqrt
 
 from rigidmd.assemble.time_step import fastest_of_scene
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.state import State
 from rigidmd.dynamics.observables import sums_of_state
 from rigidmd.engines.system import System
-from rigidmd.features.bodies.keys.body import SAMPLES
-from rigidmd.features.bodies.system import Pose
 from rigidmd.run.pilot.choice import choose
 from rigidmd.run.pilot.sampling import choose_for_averages
-from rigidmd.run.trial_systems import SPAN_PS, body_trial_system, molecular_trial_system
-from rigidmd.scene import BodyScene
+from rigidmd.run.trial_systems import SPAN_PS, molecular_trial_system
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BOLTZMANN, FEMTOSECOND
 
@@ -27,8 +22,6 @@ PILOT_PART, LEAST_SPAN = 0.01, 3.0
 #: Longest time for one radian of the mean motion in a liquid, in times of its fastest motion. In a
 #: lattice forces nearly cancel: it is stiffer after some steps than at its start.
 SLOWEST = 5.0
-#: Minimum fraction of a chosen step to which it is shortened to fit the interval of samples.
-MIN_STEP_FRACTION = 0.25
 
 
 def choose_for_stage(system: System, state: State, k: int) -> tuple[Stage, str]:
@@ -74,36 +67,3 @@ def choose_for_molecules(system: System, state: State, k: int) -> tuple[Stage, s
         trial_system, longest, stage.energy_error_kT, stage.trajectory_error, stage.duration
     )
     return stage.with_integrator(choice.integrator, choice.timestep), choice.reason
-
-
-def choose_for_body(
-    scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | None
-) -> tuple[BodyScene, str]:
-    """A scene with the best integrator and step, and the reason. Raises SimulationError."""
-    run = scene.run
-    trial_system, _ = body_trial_system(scene, applied=applied)
-    longest = {name: run.timestep_s for name in trial_system.methods if name in SCHEMES}
-    choice = choose(trial_system, longest, run.energy_error, run.trajectory_error)
-    timestep = _fit_step(choice.timestep, run.duration_s, scene.output.interval_s)
-    fitted = ""
-    if timestep != choice.timestep:
-        fitted = f", shortened to {timestep:g} s to fit duration and samples"
-    changes = {"integrator": choice.integrator, "timestep_s": timestep}
-    changed = run.model_copy(update=changes | {"energy_error": None, "trajectory_error": None})
-    reason = f"{choice.integrator} at {choice.timestep:g} s chosen{fitted}: {choice.reason}"
-    return scene.model_copy(update={"run": changed}), reason
-
-
-def _fit_step(timestep: float, duration: float, interval: float | None) -> float:
-    """The longest step up to this one that divides the duration and the interval of samples, or the
-    duration alone, if the interval or their common divisor would make it much shorter. Each step is
-    then a sample."""
-    if interval is not None and interval < MIN_STEP_FRACTION * timestep:
-        interval = duration
-    if interval is None:
-        interval = duration / SAMPLES if duration / SAMPLES >= timestep else duration
-    (a, b), (c, d) = (Fraction(repr(span)).as_integer_ratio() for span in (duration, interval))
-    common = float(Fraction(gcd(a * d, c * b), b * d))
-    longest = min(timestep, interval)
-    span = common if common >= MIN_STEP_FRACTION * longest else duration
-    return span / ceil(span / longest * (1 - 1e-9))

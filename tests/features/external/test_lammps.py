@@ -26,7 +26,7 @@ from rigidmd.features.external.lammps import files
 from rigidmd.features.external.lammps.engine import LammpsEngine
 from rigidmd.features.external.rigid_bodies import RigidBodies
 from rigidmd.features.external.verify import export, verify
-from rigidmd.features.view.figures.run import energy_figure
+from rigidmd.features.view.figures.energy import energy_figure
 from rigidmd.run import Simulation
 from rigidmd.run.record import read_record
 from rigidmd.scene import Scene

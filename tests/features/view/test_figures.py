@@ -18,17 +18,19 @@ from rigidmd.core.integrators import SCHEMES
 from rigidmd.engines.samples import NUMBERS, Sample, Samples
 from rigidmd.features.analysis.curve_figure import curve_figure as drawn
 from rigidmd.features.analysis.result import Curve
+from rigidmd.features.bodies.trials import body_trial_system
 from rigidmd.features.studies.accuracy import accuracy
 from rigidmd.features.studies.accuracy.measurement import IntegratorAccuracy
-from rigidmd.features.view.figures.panels import draw_panel, panels, timeline
+from rigidmd.features.view.figures.energy import energy_figure
+from rigidmd.features.view.figures.panels import draw_panel
 from rigidmd.features.view.figures.picture import Picture
-from rigidmd.features.view.figures.run import energy_figure
 from rigidmd.features.view.figures.space import AT_ONCE, draw_line
 from rigidmd.features.view.figures.style import COLORS, DARK_PALETTE, FAINT, PALETTE, shown_range
+from rigidmd.features.view.kind_display import panels, timeline
 from rigidmd.features.view.molecule_figure import write_molecule_figure
 from rigidmd.features.view.page import read_asset
 from rigidmd.features.view.plots import columns_figure, record_of
-from rigidmd.run.trial_systems import COMPARATORS, body_trial_system
+from rigidmd.run.trial_systems import COMPARATORS
 from rigidmd.run.trials import Trial
 from rigidmd.scene import Scene
 from rigidmd.scene.models import load_model

@@ -502,6 +502,7 @@ class BodyScene(Scene):
 
     kind: ClassVar[str] = "body"
     subject: ClassVar[str] = "a single body"
+    time_unit: ClassVar[str] = "s"
 
     body: BodyTable
     start: BodyStart = BodyStart.model_construct()

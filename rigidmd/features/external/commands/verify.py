@@ -29,14 +29,10 @@ def _engine(parser: argparse.ArgumentParser) -> None:
 )
 def _verify(options: Options) -> int:
     from rigidmd.features.external.verify import verify
-    from rigidmd.scene import MolecularScene
+    from rigidmd.scene import is_molecular
 
     scene = read_scene(options)
-    if (
-        options.engine is None
-        and isinstance(scene, MolecularScene)
-        and not scene.engine.is_external
-    ):
+    if options.engine is None and is_molecular(scene) and not scene.engine.is_external:
         options.engine, *_ = runnable()
     if options.engine in runnable():
         for key, value in runnable()[options.engine].precise.items():

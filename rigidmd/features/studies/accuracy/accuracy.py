@@ -3,10 +3,11 @@ of a scene. As a table, recommendations, accuracy.csv, .png and a self-contained
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
-from rigidmd.core.integrators import RADAU, SCHEMES, SOLVERS
+from rigidmd.core.integrators import RADAU, SCHEMES
 from rigidmd.errors import SceneError, option
 from rigidmd.features.studies.accuracy.averages import (
     check_engine_is_rigidmd,
@@ -16,6 +17,7 @@ from rigidmd.features.studies.accuracy.averages import (
 )
 from rigidmd.features.studies.accuracy.measurement import IntegratorAccuracy, measure, plan
 from rigidmd.features.studies.accuracy.orders import FLOOR_MARK, order_table, with_marks
+from rigidmd.features.studies.kind_study import AccuracyStart, study_of
 from rigidmd.features.view.figures.style import (
     FAINT,
     INK,
@@ -30,30 +32,27 @@ from rigidmd.io.write import Column, Table, columns_text
 from rigidmd.run.force_errors import single_precision_errors
 from rigidmd.run.trial_systems import (
     COMPARATORS,
+    NOT_MOLECULAR,
     SPAN_PS,
-    body_trial_system,
     molecular_trial_system,
 )
 from rigidmd.run.trials import Trial
-from rigidmd.scene import BodyScene, MolecularScene
+from rigidmd.scene import MolecularScene, Scene, is_molecular
 from rigidmd.scene.validation import did_you_mean
 
-#: Default integrators: velocity Verlet, the best of each kind, those of [[integrators]]; for a body
-#: also solvers.
+#: Default integrators: velocity Verlet, the best of each kind, those of [[integrators]]; where they
+#: suit also solvers.
 DEFAULT_INTEGRATORS = (
     *(name for name, scheme in SCHEMES.items() if scheme.is_default),
     *(name for name, (solver, _) in COMPARATORS.items() if solver != RADAU),
 )
 #: Time steps per force evaluation, relative to the scene's; longer ones follow until one fails.
 LADDER = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125)
-RADIANS = 0.1  # rotation of a spinning body per force evaluation in the middle of the ladder, rad
-#: step of a body that does not rotate, in the step of its scene, which is assumed to be suitable
-AT_REST = 8.0
 AT_A_POLE = "the start has theta = 0 or 180 degrees, where Euler angles are singular"
 
 
 def measure_accuracy(
-    scene: MolecularScene | BodyScene,
+    scene: Scene,
     integrators: list[str] | None = None,
     timesteps: list[float] | None = None,
     span: float | None = None,
@@ -87,27 +86,16 @@ def measure_accuracy(
     check_times(scene, lengths, f"time steps and {option('span')}")
     if repeats < 1:
         raise SceneError("accuracy", [f"{option('repeats')} must be at least 1"])
-    if isinstance(scene, MolecularScene) and (
-        refused := [name for name in integrators if name in COMPARATORS]
-    ):
-        reasons = [f"{name} does not suit this scene: it is for single bodies" for name in refused]
+    if is_molecular(scene) and (refused := [name for name in integrators if name in COMPARATORS]):
+        reasons = [f"{name} does not suit this scene: {NOT_MOLECULAR}" for name in refused]
         raise SceneError(scene.source, reasons)
     progress(0.0)
-    is_body = isinstance(scene, BodyScene)
-    if is_body:
-        trial_system, speed = body_trial_system(scene, span)
-        evaluations = scene.run.row.force_evaluations if scene.run.has_scheme else 1
-        base = RADIANS / speed if speed else AT_REST * scene.run.timestep_s / evaluations
+    study = study_of(scene)
+    if study:
+        start = study.accuracy_start(scene, span)
     else:
-        last = scene.stages[-1]
-        if last.is_minimisation:
-            what = "the last stage is a minimisation: accuracy needs another stage at the end"
-            raise SceneError(scene.source, [what])
-        simulation, state = start_of_last_stage(scene)
-        trial_system = molecular_trial_system(simulation.system, state, last.rotor, span or SPAN_PS)
-        trial_system.rounding = single_precision_errors(simulation.system, state)
-        evaluations = last.row.force_evaluations if last.has_scheme else 1
-        base = simulation.scene.stages[-1].step_fs / evaluations
+        start = _molecular_start(cast(MolecularScene, scene), span)
+    trial_system = start.trial_system
     if refused := [name for name in integrators if name not in trial_system.methods]:
         reasons = [
             f"{name} does not suit this scene: {trial_system.refused[name]}" for name in refused
@@ -115,21 +103,18 @@ def measure_accuracy(
         raise SceneError(scene.source, reasons)
     left_out = {}
     if not integrators:
-        defaults = [name for name in DEFAULT_INTEGRATORS if is_body or name in SCHEMES]
+        defaults = [name for name in DEFAULT_INTEGRATORS if study or name in SCHEMES]
         defaults += [row.name for row in scene.integrators]
         left_out = {name: why for name, why in trial_system.refused.items() if name in defaults}
         left_out |= {name: AT_A_POLE for name in trial_system.singular if name in defaults}
-        of_scene = _method_name(
-            scene.run.integrator if is_body else scene.stages[-1].integrator, scene
-        )
-        candidates = dict.fromkeys((*defaults, of_scene))
+        candidates = dict.fromkeys((*defaults, _method_name(start.integrator, scene)))
         integrators = [
             name for name in candidates if name in trial_system.methods and name not in left_out
         ]
     steps = {
         name: (
             timesteps
-            or [base * rung * trial_system.methods[name].force_evaluations for rung in LADDER]
+            or [start.base * rung * trial_system.methods[name].force_evaluations for rung in LADDER]
         )
         for name in integrators
     }
@@ -142,14 +127,24 @@ def measure_accuracy(
     return measured
 
 
-def _method_name(name: str, scene: MolecularScene | BodyScene) -> str:
-    """The full name of a method: for solvers with the formulation of the scene, unless it is the
-    matrix."""
-    solver, _, form = name.partition("_")
-    if solver in SOLVERS and isinstance(scene, BodyScene):
-        form = form or scene.run.formulation
-        return solver if form in (None, "matrix") else f"{solver}_{form}"
-    return name
+def _molecular_start(scene: MolecularScene, span: float | None) -> AccuracyStart:
+    """Molecules at the start of their last stage. Raises SceneError."""
+    last = scene.stages[-1]
+    if last.is_minimisation:
+        what = "the last stage is a minimisation: accuracy needs another stage at the end"
+        raise SceneError(scene.source, [what])
+    simulation, state = start_of_last_stage(scene)
+    trial_system = molecular_trial_system(simulation.system, state, last.rotor, span or SPAN_PS)
+    trial_system.rounding = single_precision_errors(simulation.system, state)
+    evaluations = last.row.force_evaluations if last.has_scheme else 1
+    base = simulation.scene.stages[-1].step_fs / evaluations
+    return AccuracyStart(trial_system, base, last.integrator)
+
+
+def _method_name(name: str, scene: Scene) -> str:
+    """The full name of a method, of a solver with the variables of the scene."""
+    study = study_of(scene)
+    return study.method_name(name, scene) if study else name
 
 
 FILES = ("accuracy.csv", "accuracy.png", "accuracy.html")

@@ -17,10 +17,11 @@ from rigidmd.engines.samples import COLUMNS, NOT_AVERAGED, Samples
 from rigidmd.errors import SceneError, SimulationError, option
 from rigidmd.features.studies.extrapolation import BiasFit, MeanAtStep, extrapolate
 from rigidmd.run import Simulation
+from rigidmd.run.kind import kind_of
 from rigidmd.run.mean_box import scale_to_mean_box
 from rigidmd.run.observers import Every
 from rigidmd.run.stable_step import stiffest_mode
-from rigidmd.scene import BodyScene, MolecularScene
+from rigidmd.scene import MolecularScene, Scene, is_molecular
 from rigidmd.scene.ensembles import THERMOSTATS
 from rigidmd.scene.stage import ERROR_TARGETS, MOST_STEPS, Stage
 from rigidmd.scene.validation import did_you_mean
@@ -159,15 +160,15 @@ EQUILIBRATION = 0.2
 SAMPLING_INTERVAL_PS, MOST_SAMPLES = 0.02, 4000
 
 
-def check_engine_is_rigidmd(scene: MolecularScene | BodyScene) -> None:
+def check_engine_is_rigidmd(scene: Scene) -> None:
     """Raise SceneError if a scene names another engine: only the integrators of rigidmd are
     measured."""
-    if isinstance(scene, MolecularScene) and scene.engine.is_external:
+    if is_molecular(scene) and scene.engine.is_external:
         error = f"engine.name = {scene.engine.name!r}: accuracy measures rigidmd. Leave it out"
         raise SceneError(scene.source, [error])
 
 
-def check_times(scene: MolecularScene | BodyScene, times: Iterable[float], names: str) -> None:
+def check_times(scene: Scene, times: Iterable[float], names: str) -> None:
     """Raise SceneError unless times have a size that numbers of a scene may have."""
     least, largest = scene.SIZES
     if not all(least <= time <= largest for time in times):
@@ -183,7 +184,7 @@ def check_number_of_steps(duration: float, step: float) -> None:
 
 
 def measure_averages(
-    scene: MolecularScene | BodyScene,
+    scene: Scene,
     methods: list[str] | None = None,
     timesteps: list[float] | None = None,
     sample: float = SAMPLE_PS,
@@ -200,11 +201,8 @@ def measure_averages(
 
     The earlier stages of the scene run before, once.
     """
-    if isinstance(scene, BodyScene):
-        raise SceneError(
-            scene.source,
-            [f"{option('averages')} is for molecules. A single body has no thermostat"],
-        )
+    kind_of(scene).check_has(scene, "averages", option=option("averages"))
+    scene = cast(MolecularScene, scene)
     check_engine_is_rigidmd(scene)
     stage = _with_thermostat(scene)
     schemes = scene.schemes | WITH_THERMOSTAT

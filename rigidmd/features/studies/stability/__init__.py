@@ -1,4 +1,7 @@
 """Stress tests of the engine, each compared with a known answer."""
 
-from rigidmd.features.bodies import stability  # noqa: F401
-from rigidmd.features.studies.stability import molecules  # noqa: F401  (register builders)
+from rigidmd.features.studies.kind_study import studies
+from rigidmd.features.studies.stability import molecules  # noqa: F401  (registers builders)
+
+for _, study in studies():
+    study.add_stability_cases()

@@ -44,8 +44,8 @@ class Outcome(NamedTuple):
 class Trial(NamedTuple):
     """A setting of a case and its expected outcome. It runs with several integrators.
 
-    It lasts for its duration or number of steps, whichever is longer. Times are in s for a body, in
-    fs for molecules.
+    It lasts for its duration or number of steps, whichever is longer. Times are in fs, for other
+    kinds of scenes than molecules in s.
     """
 
     setting: str = ""
@@ -141,3 +141,15 @@ def _sites(molecule: str) -> Json:
 
 
 CASES = {name: Case(name, **table) for name, table in TABLES["cases"].items()}
+
+
+def add_cases(path: Path) -> None:
+    """Add the cases of a feature, with its [methods] and [shared]. Cases stay in the order of their
+    groups."""
+    tables = parse_toml(path.read_text(encoding="utf-8"))
+    for key in ("methods", "shared"):
+        TABLES[key] |= tables[key]
+    added = {name: Case(name, **table) for name, table in tables["cases"].items()}
+    in_order = sorted((added | CASES).values(), key=lambda case: case.group)
+    CASES.clear()
+    CASES.update({case.name: case for case in in_order})

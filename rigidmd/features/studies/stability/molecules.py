@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.assemble.describe import describe
 from rigidmd.core.state import State
 from rigidmd.core.statistics import mean_and_error
 from rigidmd.core.toml import Json
@@ -21,6 +20,7 @@ from rigidmd.features.studies.stability.runner import (
     run_scene,
     system_of,
 )
+from rigidmd.run.kind import describe
 from rigidmd.run.results import Results
 from rigidmd.scene import Scene
 from rigidmd.scene.validation import not_none

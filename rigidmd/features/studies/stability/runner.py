@@ -16,7 +16,7 @@ from rigidmd.core.state_file import write_state
 from rigidmd.core.toml import Json
 from rigidmd.engines.system import System
 from rigidmd.errors import RigidMDError, SceneError
-from rigidmd.features.bodies.summary import LARGE_ENERGY_ERROR
+from rigidmd.features.studies.kind_study import studies
 from rigidmd.features.studies.stability.cases import (
     BOUND,
     CASES,
@@ -31,6 +31,7 @@ from rigidmd.features.studies.stability.cases import (
     Trial,
 )
 from rigidmd.run import Simulation
+from rigidmd.run.failed_check import LARGE_ENERGY_ERROR
 from rigidmd.run.results import Results
 from rigidmd.scene import MolecularScene, Scene
 
@@ -175,11 +176,9 @@ def complete_scene(trial: Trial, integrator: str, step: float) -> Json:
     """The tables of a scene with those of a run that writes no files, unless it has its own."""
     method = TABLES["methods"][integrator]
     trial = trial._replace(step=step)
-    if "body" in trial.scene:
-        interval = min(max(step, trial.span / trial.samples), trial.span)
-        output = {"trajectory": False, "figures": False, "interval_s": interval}
-        run = method | {"duration_s": trial.span, "timestep_s": step}
-        return {"run": run, "output": output, **trial.scene}
+    for table, study in studies():
+        if table in trial.scene:
+            return study.complete_trial(trial, method, step)
     steps = max(trial.steps, round(trial.duration / step))
     interval = min(1e9, step * max(1, steps // trial.samples) / 1000)
     output = {"trajectory": False, "log_interval_ps": interval}

@@ -39,7 +39,7 @@ from rigidmd.features.view.page import code, items, plain, section, table, wide,
 from rigidmd.io.folder import SCENE, add_to_folder
 from rigidmd.io.write import Cell, Table, nine_digits
 from rigidmd.run.record import read_record
-from rigidmd.scene import MolecularScene, Scene
+from rigidmd.scene import Scene, is_molecular
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -154,7 +154,7 @@ def step_key(manifest: Manifest, key: str, scene: Scene) -> tuple[str, int]:
     key : that key, or one that varies together with it; scene : of one of the points
     """
     first = next((first for first, together in manifest.keys.items() if key in together), None)
-    stages = scene.stages if isinstance(scene, MolecularScene) else ()
+    stages = scene.stages if is_molecular(scene) else ()
     last = max((k for k, stage in enumerate(stages) if not stage.is_minimisation), default=0)
     label = stages[last].label if stages else ""
     usual = f"stages.{last}.timestep_fs"

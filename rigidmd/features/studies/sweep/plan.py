@@ -17,7 +17,6 @@ from math import inf, prod
 from pathlib import Path
 from typing import NamedTuple
 
-from rigidmd.assemble.scenes import resolve
 from rigidmd.core.toml import (
     Json,
     TOMLDecodeError,
@@ -42,6 +41,7 @@ from rigidmd.features.studies.sweep.folder import (
     without_seed,
 )
 from rigidmd.io.folder import elsewhere
+from rigidmd.run.kind import resolve
 from rigidmd.run.resume import (
     NOT_COMPARED,
     describe_differences,
@@ -53,6 +53,7 @@ from rigidmd.run.resume import (
     scene_digest,
 )
 from rigidmd.scene import MolecularScene, Scene, parse_override
+from rigidmd.scene.kinds import class_for
 from rigidmd.scene.validation import in_python, setting
 
 MOST_POINTS = 100_000  # largest number of points of a sweep
@@ -154,9 +155,10 @@ def with_seeds(
     scene: Path, axes: list[Axis], replicas: int, data: Mapping[str, object]
 ) -> list[Axis]:
     """The axes with an axis of the seeds of replicas."""
-    if "body" in data:
+    kind = class_for(data)
+    if kind is not None and SEED not in kind.model_fields:
         raise SceneError(
-            option("replicas"), [f"{scene} is a single body, whose motion has no seed"]
+            option("replicas"), [f"{scene} is {kind.subject}, whose motion has no seed"]
         )
     seed = data.get(SEED, MolecularScene.model_fields[SEED].default)
     others = [axis for axis in axes if SEED not in axis.keys]

@@ -13,13 +13,13 @@ import numpy as np
 from rigidmd.core.display import Displayed
 from rigidmd.core.statistics import format_with_error, mean_and_error, standard_error
 from rigidmd.core.toml import Json
-from rigidmd.engines.samples import BODY_COLUMNS, IN_LOGS, NOT_AVERAGED
+from rigidmd.engines.samples import IN_LOGS, NOT_AVERAGED
 from rigidmd.engines.system import System
 from rigidmd.errors import RigidMDError
 from rigidmd.features.analysis.files import TableEntry, read_table
 from rigidmd.features.analysis.result import AnalysisResult
 from rigidmd.features.analysis.rigid_frames import earlier_production, production_samples
-from rigidmd.features.bodies.system import BodySystem
+from rigidmd.features.studies.kind_study import Measured, studies, study_of
 from rigidmd.features.studies.sweep.folder import (
     SEED,
     Manifest,
@@ -36,25 +36,12 @@ if TYPE_CHECKING:
 
 POTENTIAL, DRIFT = "Potential Energy per molecule (kJ/mole)", "Drift (kT/ns per degree of freedom)"
 DENSITY, PRESSURE = "Density (g/mL)", "Pressure (bar)"
-#: Columns of the printed table and the figure: for molecules, for a body.
+#: Columns of the printed table and the figure.
 MAIN = ("Temperature (K)", POTENTIAL, PRESSURE, DENSITY, DRIFT)
-MAIN_OF_BODY = (
-    "theta lowest (rad)",
-    "theta highest (rad)",
-    "energy end (J)",
-    "energy_error largest",
-    "L_size_error largest",
-)
 #: Short titles for the printed table.
 SHORT = {POTENTIAL: "U per molecule (kJ/mol)", DRIFT: "drift (kT/ns/DOF)"}
 #: The box, whose averages over an earlier stage are in the table if that stage changes it.
 OF_BOX = tuple(IN_LOGS[name].header for name in ("volume", "a", "b", "c", "alpha", "beta", "gamma"))
-#: Columns of a body that are not in the table; nor are the entries of Q and of the quaternion.
-NOT_OF_BODY = ("time", "orthogonality_error")
-OF_ROTATION = ("q1", "q2", "q3", "qw", "qx", "qy", "qz")
-
-#: A value and its error, or None.
-Measured = tuple[float, float | None]
 
 
 @dataclass
@@ -171,7 +158,8 @@ class Table(Displayed):
         """The columns that are printed and drawn: the main ones, and the densities of stages before
         the last one."""
         earlier = [column for column in self.columns if column.endswith(f": {DENSITY}")]
-        return [name for name in (*MAIN, *MAIN_OF_BODY) if name in self.columns] + earlier
+        more = [name for _, study in studies() for name in study.main_columns]
+        return [name for name in (*MAIN, *more) if name in self.columns] + earlier
 
 
 def report_of(lines: Sequence[Mapping[str, Cell]]) -> ReportTable:
@@ -225,10 +213,9 @@ def measured_values(results: Iterable[AnalysisResult | TableEntry]) -> dict[str,
 
 
 def summarise_run(record: Record) -> dict[str, Measured]:
-    """Results of a run: means over the production of molecules, extremes of the motion of a body.
-    Raises OutputError."""
-    if record.is_body:
-        return _summarise_motion(record)
+    """Results of a run, of molecules the means over the production. Raises OutputError."""
+    if study := study_of(record.scene):
+        return study.summarise(record)
     _, production = production_samples(record)
     results = _means_of(record, production)
     for stage, samples in earlier_production(record):
@@ -259,18 +246,3 @@ def _means_of(record: Record[System], samples: np.ndarray) -> dict[str, Measured
             n = len(record.system.model.species)
             means[POTENTIAL] = average / n, None if error is None else error / n
     return means
-
-
-def _summarise_motion(record: Record[BodySystem]) -> dict[str, Measured]:
-    results: dict[str, Measured] = {}
-    for name, values in record.columns.items():
-        if name in NOT_OF_BODY or name[:2] in OF_ROTATION or not np.isfinite(values).all():
-            continue
-        if name.endswith("_error"):
-            results[f"{name} largest"] = float(np.abs(values).max()), None
-            continue
-        unit = BODY_COLUMNS[name].unit if name in BODY_COLUMNS else "1"
-        numbers = values.mean(), values.min(), values.max(), values[-1]
-        for word, number in zip(("mean", "lowest", "highest", "end"), numbers, strict=True):
-            results[f"{name} {word} ({unit})"] = float(number), None
-    return results

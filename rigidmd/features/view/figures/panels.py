@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from rigidmd.engines.samples import moving
-from rigidmd.features.bodies.system import BodySystem
 from rigidmd.features.view.figures.style import (
     COLORS,
     FAINT,
@@ -26,8 +25,6 @@ if TYPE_CHECKING:
     from rigidmd.engines.system import System
     from rigidmd.features.view.figures.picture import Picture
 
-#: Errors of exactly 0 are drawn at this value.
-FLOOR = 1e-17
 #: Inches: a line of text, the space left and right of an axis.
 LINE, LEFT, RIGHT = 0.165, 0.75, 0.2
 #: Inches below an axis: without numbers, with them, with numbers and their unit.
@@ -38,8 +35,6 @@ MOST_ROWS = 5
 WIDTH, HEIGHT = 7.2, 2.1
 #: Points of a curve are thinned to twice this number in each stage.
 BINS = 600
-#: Names of errors in legends.
-LABELS = {"L_lab_error": "L in the lab", "L_size_error": "|L|"}
 #: Inches of a letter in a legend.
 LETTER = 0.068
 #: Ranges below this fraction of the values are rounding.
@@ -99,21 +94,11 @@ class Timeline(NamedTuple):
 Rows = Sequence[Sequence[tuple[Timeline, Panel]]]
 
 
-def timeline(system: "System | BodySystem", columns: Mapping[str, np.ndarray]) -> Timeline:
-    time = columns["time"]
-    if isinstance(system, BodySystem):
-        return Timeline(np.ones(len(time), bool), time, np.zeros(len(time), int), "s")
-    stages, stage = system.scene.stages, columns["stage"].astype(int)
+def molecular_timeline(system: "System", columns: Mapping[str, np.ndarray]) -> Timeline:
+    time, stages, stage = columns["time"], system.scene.stages, columns["stage"].astype(int)
     shown = moving(stages, stage)
     names = tuple(stage.label for stage in stages)
     return Timeline(shown, time[shown], stage[shown], "ps", names)
-
-
-def panels(system: "System | BodySystem", columns: Mapping[str, np.ndarray]) -> list[Panel]:
-    """The panels of a run that its columns allow."""
-    if isinstance(system, BodySystem):
-        return [panel for family in body_panels(system, columns).values() for panel in family]
-    return molecular_panels(system, columns)
 
 
 def molecular_panels(system: "System", columns: Mapping[str, np.ndarray]) -> list[Panel]:
@@ -138,72 +123,6 @@ def molecular_panels(system: "System", columns: Mapping[str, np.ndarray]) -> lis
         found += panel("density (g/cm³)", {"density": ""})
         found += panel("edges of the box (Å)", {edge: edge for edge in "abc"})
     return found
-
-
-def body_panels(system: BodySystem, columns: Mapping[str, np.ndarray]) -> dict[str, list[Panel]]:
-    """Panels by what they show: angles, omega, position, energy, invariants."""
-    families: dict[str, list[Panel]] = {}
-    if "theta" in columns:
-        families["angles"] = _angle_panels(columns)
-    if "omega_body_1" in columns:
-        omega = [(f"ω{'₁₂₃'[k - 1]}", columns[f"omega_body_{k}"]) for k in (1, 2, 3)]
-        families["omega"] = [Panel("angular velocity in the body frame (rad/s)", omega)]
-    if system.translates:
-        position = np.stack([columns[key] for key in "xyz"])
-        least = 1e-11 * np.ptp(position, axis=1).max() + 1e-13 * np.abs(position).max()
-        families["position"] = [
-            Panel(f"{key} of the centre of mass (m)", [("", values)], least=least)
-            for key, values in zip("xyz", position, strict=True)
-            if np.ptp(position) > 0
-        ]
-    energies = [(name, columns[name]) for name in ("kinetic", "potential", "energy")]
-    families["energy"] = [Panel("energies (J)", energies)]
-    errors = [
-        (LABELS.get(name, name.removesuffix("_error")), np.abs(values))
-        for name, values in columns.items()
-        if name.endswith("_error") and np.isfinite(values).any()
-    ]
-    families["invariants"] = [error_panel(errors)] if errors else []
-    return families
-
-
-def error_panel(errors: list[tuple[str, np.ndarray]]) -> Panel:
-    """Relative errors of what is conserved, on a logarithmic axis."""
-    rounding = float(np.finfo(float).eps)
-    title = f"relative errors (dotted: rounding, {rounding:.1e}; 0 is drawn at {FLOOR:.0e})"
-    curves = [(label, np.maximum(error, FLOOR)) for label, error in errors]
-    return Panel(title, curves, log=True, level=rounding)
-
-
-def _angle_panels(columns: Mapping[str, np.ndarray]) -> list[Panel]:
-    """The Euler angles: φ and ψ continuous over full rotations."""
-    angles = {name: columns[name].copy() for name in ("phi", "theta", "psi")}
-    phi, theta, psi = angles.values()
-    # at θ = 0 or 180° only the sum or the difference of φ and ψ is defined: φ has its value in the
-    # next sample
-    for k in np.flatnonzero(np.sin(theta[:-1]) < 1e-12)[::-1]:
-        psi[k] += (phi[k] - phi[k + 1]) * np.sign(np.cos(theta[k]))
-        phi[k] = phi[k + 1]
-    found = []
-    for name, angle in zip("φθψ", (np.unwrap(phi), theta, np.unwrap(psi)), strict=True):
-        degrees = np.degrees(angle)
-        unit, size = ("turns", 360) if np.ptp(degrees) > 360 else ("°", 1)
-        change = angle_range(degrees)
-        if name != "θ" and np.ptp(degrees) > 1e-5:
-            first, last = np.round(degrees[[0, -1]], 6) + 0.0
-            change = f"from {first:.6g}° to {last:.6g}°, {(last - first) / 360:+.4g} turns"
-        found.append(Panel(f"{name} ({unit}), {change}", [("", degrees / size)], least=1e-5))
-    return found
-
-
-def angle_range(degrees: np.ndarray) -> str:
-    """A range of degrees as text, with enough digits to distinguish its ends."""
-    low, high = degrees.min(), degrees.max()
-    if high - low < 1e-5:
-        size = f" to {high - low:.0e}°" if high > low else ""
-        return f"{round(low, 6) + 0.0:.8g}°, constant{size}"
-    digits = int(np.clip(2 - np.floor(np.log10(high - low)), 1, 8))
-    return f"from {low:.{digits}f}° to {high:.{digits}f}°"
 
 
 def draw_panel(axis: "Axes", times: Timeline, panel: Panel) -> None:

@@ -14,6 +14,7 @@ from support.common import ROOT, small_scene
 from rigidmd.commands.cli import main
 from rigidmd.core.integrators import FORMULATIONS
 from rigidmd.errors import SceneError
+from rigidmd.features.bodies.trials import body_trial_system
 from rigidmd.features.studies.accuracy import accuracy
 from rigidmd.features.studies.accuracy.accuracy import (
     measure_accuracy,
@@ -24,7 +25,6 @@ from rigidmd.features.studies.accuracy.accuracy import (
 )
 from rigidmd.features.studies.accuracy.measurement import IntegratorAccuracy
 from rigidmd.features.studies.accuracy.orders import convergence, order_table
-from rigidmd.run.trial_systems import body_trial_system
 from rigidmd.run.trials import Trial
 from rigidmd.scene import Scene
 

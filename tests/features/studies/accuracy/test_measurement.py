@@ -9,10 +9,10 @@ from support.common import ROOT, small_scene
 
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.errors import SimulationError
+from rigidmd.features.bodies.trials import body_trial_system
 from rigidmd.features.studies.accuracy import measurement
 from rigidmd.features.studies.accuracy.accuracy import measure_accuracy, recommendations, table_text
 from rigidmd.features.studies.accuracy.measurement import measure, time_span
-from rigidmd.run.trial_systems import body_trial_system
 from rigidmd.run.trials import Method, Trial
 from rigidmd.scene import Scene
 

@@ -23,7 +23,7 @@ from rigidmd.commands.streams import announce
     writes=True,
 )
 def _gallery(options: Options) -> int:
-    from rigidmd.features.view.run_page import INDEX, selected_bodies, write_gallery
+    from rigidmd.features.bodies.gallery import INDEX, selected_bodies, write_gallery
     from rigidmd.io.write import check_target
 
     folder = Path(options.output)
