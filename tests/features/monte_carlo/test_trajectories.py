@@ -82,12 +82,13 @@ def test_a_rejected_trajectory_leaves_no_trace():
     assert len(seen) > 5
 
 
-@pytest.mark.parametrize(
-    "pressed", [{}, {"ensemble": "npt", "pressure_bar": 100.0, "barostat_interval_ps": 0.25}]
-)
+PRESSED = {"ensemble": "npt", "pressure_bar": 100.0, "barostat_interval_ps": 0.25}
+
+
+@pytest.mark.parametrize("pressed", [{}, PRESSED, PRESSED | {"integrator": "position_verlet"}])
 def test_energy_less_heat_and_work_is_conserved(pressed):
     """Accepted errors of the energy are heat, and not a drift; rejected ones leave none,
-    also if the next move of the box needs the virial."""
+    also if the next move of the box needs the virial, and if a step ends with a drift."""
     stage = {"timestep_fs": 50.0, "trajectory_steps": 5, "duration_ps": 20.0} | pressed
     forces = {"cutoff_A": 5.0, "electrostatics": "none", "tail_correction": False}
     results, _ = sampled(stage, MIXTURE, 13.0, 0.25, forces=forces, precision="double")
