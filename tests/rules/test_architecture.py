@@ -197,6 +197,84 @@ def build():
     assert [message.split(":")[0] for message in upward("mechanics", inner)] == ["1", "2", "3", "4"]
 
 
+def test_keys_belong_to_scenes():
+    """They import nothing else of the core, and only `scene` imports them, by names."""
+    below = LAYERS[: LAYERS.index("scene")]
+    errors = []
+    for path in FILES:
+        module = module_of(path)
+        is_keys = feature_of(module) and layer_of(module) == "scene"
+        for line, name in imports(path):
+            imported = name.removeprefix("rigidmd.")
+            if not name.startswith("rigidmd."):
+                continue
+            if is_keys and layer_of(imported) not in (*below, "scene"):
+                errors.append(f"{name_of(path)}:{line}: keys import {name}")
+            ours = {feature_of(module), ""}
+            to_keys = feature_of(imported) and layer_of(imported) == "scene"
+            if to_keys and feature_of(imported) not in ours and module.partition(".")[0] != "scene":
+                errors.append(f"{name_of(path)}:{line}: imports keys, {name}")
+    assert not errors, "\n".join(errors)
+
+
+#: Feature -> its words, which do not occur in the core.
+WORDS = {
+    "bodies": r"gyroscop|fluid|satellite|precession",
+    "external": r"rigidmd (export|verify)",
+    "free_energy": r"insert(s|ed|ion of molecules)\b|lambda_|soft.core|virial coefficient|mean force",
+    "monte_carlo": r"hybrid",
+    "potentials": r"gay.berne|multipole|pair_potential\b",
+    "studies": r"replica|rigidmd (sweep|accuracy)",
+    "view": r"animation|film|chemiscope",
+}
+#: Files of the core with such a word -> why.
+NAMED = {
+    "core/shipped.py": "titles of pages",
+    "scene/hints.py": "keys of other kinds of scenes",
+}
+
+
+def test_the_core_does_not_know_the_words_of_features():
+    found = {
+        f"{name_of(path)}:{number}: {name}: {match[0]}"
+        for name, words in WORDS.items()
+        for path in FILES
+        if not feature_of(module_of(path)) and layer_of(module_of(path)) in LAYERS[4:]
+        if name_of(path) not in NAMED
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+        if (match := re.search(words, line, re.IGNORECASE))
+    }
+    assert not found, "\n".join(sorted(found))
+
+
+def running_imports(path):
+    """The modules of rigidmd that a file imports when it runs: imports for type checkers are left
+    out."""
+    source = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(source):
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            node.body = [ast.Pass()]
+    found = (name for _, name in imports_in(ast.unparse(source)))
+    return {name.removeprefix("rigidmd.") for name in found if name.startswith("rigidmd.")}
+
+
+def test_modules_form_no_circles():
+    """Also of different packages, and by imports inside functions."""
+    graph = {module_of(path): running_imports(path) for path in FILES}
+    done: set[str] = set()
+
+    def circle(module, above):
+        if module in above:
+            return (*above[above.index(module) :], module)
+        if module in done or module not in graph:
+            return ()
+        done.add(module)
+        return next((c for m in sorted(graph[module]) if (c := circle(m, (*above, module)))), ())
+
+    circles = [" -> ".join(found) for module in sorted(graph) if (found := circle(module, ()))]
+    assert not circles, "\n".join(circles)
+
+
 def test_each_library_has_its_packages():
     errors = [
         f"{name_of(path)}:{line}: imports {module}"
