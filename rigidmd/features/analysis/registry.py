@@ -7,7 +7,7 @@ from importlib import import_module
 from math import inf
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -254,10 +254,10 @@ class SweepAnalysis(NamedTuple):
     over: str  # what the sweep varies
     title: str  # of its points
     #: Whether a sweep has it without a request. The argument is its manifest
-    is_default: Callable[[Any], bool]
+    is_default: Callable[..., bool]
     #: Analyses the finished points, and writes files. The arguments are the manifest and the type
     #: of figures
-    write: Callable[[Any, str], tuple[AnalysisResult, list[Path]]]
+    write: Callable[..., tuple[AnalysisResult, list[Path]]]
 
 
 def sweep_analyses() -> list[SweepAnalysis]:
