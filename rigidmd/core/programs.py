@@ -36,7 +36,7 @@ class Program(NamedTuple):
     describe: Callable[..., str] = lambda **options: ""  # name and options for reports
     #: A message on options that contradict each other
     option_errors: Callable[..., str] = lambda **options: ""
-    # the options with which `rigidmd verify` compares, unless others are given
+    # the options with which it is compared, unless others are given
     precise: Mapping[str, object] = {}
     thermostat: str | None = None  # its default thermostat in place of rigidmd's
     barostat: str | None = None  # likewise of npt; None if its barostat has no name in a scene
@@ -62,7 +62,7 @@ def programs() -> dict[str, Program]:
         if row.programs and row.is_installed:
             for folder in iter_modules(import_module(row.package).__path__):
                 path = f"{row.package}.{folder.name}.program"
-                if folder.ispkg and find_spec(path):
+                if folder.ispkg and folder.name != "commands" and find_spec(path):
                     record = import_module(path).PROGRAM
                     found[folder.name] = record._replace(name=folder.name, feature=row)
     return found

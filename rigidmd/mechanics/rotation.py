@@ -148,7 +148,7 @@ def euler_rates(euler_angles: np.ndarray, angular_velocity_body: np.ndarray) -> 
 
 
 def attitude_matrix(rotation: np.ndarray) -> np.ndarray:
-    """T = Q^T (..., 3, 3) of the satellite literature: lab to body, dT/dt = -hat(omega_body) T."""
+    """T = Q^T (..., 3, 3), the attitude matrix: lab to body, dT/dt = -hat(omega_body) T."""
     return np.swapaxes(np.asarray(rotation, dtype=float), -1, -2).copy()
 
 

@@ -3,6 +3,7 @@
 import difflib
 import re
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 
 from pydantic import BaseModel
@@ -19,6 +20,9 @@ TABLES = {
     "structure": ("input", "coordinates", "configuration"),
     "output": ("files", "reporters", "dump"),
 }
+#: Functions that return the classes of scenes, which are validated with these hints. They are in
+#: `scene.kinds`.
+KINDS: list[Callable[[], list]] = []
 MOST_LISTED = 8  # known keys in a message
 BOHR = 0.529177210903  # Å
 CELSIUS = ("C", "degC", "celsius")
@@ -88,9 +92,9 @@ def hint_on_key(name: str, keys: list, value: object, model: type[BaseModel]) ->
 def _only_subject(name: str) -> str:
     """What moves in the only kind of scenes that have a key at the top level. Empty if several or
     none have it."""
-    from rigidmd.scene.kinds import scene_classes  # they are validated with these hints
-
-    subjects = [scene.subject for scene in scene_classes() if name in scene.model_fields]
+    subjects = [
+        scene.subject for scenes in KINDS for scene in scenes() if name in scene.model_fields
+    ]
     return subjects[0] if len(subjects) == 1 else ""
 
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 from rigidmd.features import FEATURES
 from rigidmd.scene.base import Scene
+from rigidmd.scene.hints import KINDS
 
 MOLECULES = "molecules"
 #: Kind of scene -> the feature that adds it.
@@ -25,6 +26,9 @@ def scene_classes() -> list[type[Scene]]:
         *(scene_class(kind) for kind, row in ADDED.items() if row.is_installed),
         scene_class(MOLECULES),
     ]
+
+
+KINDS.append(scene_classes)
 
 
 def class_for(data: Mapping[str, object]) -> type[Scene] | None:

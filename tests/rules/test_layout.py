@@ -35,9 +35,10 @@ TESTED_BY = {
     "features/analysis/test_conditions.py": "features/analysis/options",
     "features/analysis/test_structure.py": "features/analysis/pair_histogram",
     "features/analysis/test_transport.py": "features/analysis/relaxation",
+    "mechanics/test_free_rotor.py": "mechanics/inertia mechanics/vectors",
     "features/bodies/test_engine.py": "features/bodies/assemble features/bodies/defaults"
     " features/bodies/step_loop features/bodies/motion features/bodies/system features/bodies/cpu_engine"
-    " features/bodies/forces/applied mechanics/translation",
+    " features/bodies/forces/applied features/bodies/translation",
     "features/bodies/test_fluid.py": "features/bodies/forces/resistance",
     "features/bodies/test_frames.py": "mechanics/time_functions",
     "features/bodies/test_input.py": "features/bodies/keys/body features/bodies/keys/forces features/bodies/describe",

@@ -79,7 +79,7 @@ CORE = [
     Mutation(
         "A7",
         "a frame that spins up: its rate at the start of a step, not in the middle",
-        "mechanics/translation.py",
+        "features/bodies/translation.py",
         "frame_rate(frame, time + 0.5 * h)",
         "frame_rate(frame, time)",
         (

@@ -10,8 +10,7 @@ from rigidmd.features.bodies.mesh import mesh_of
 from rigidmd.features.bodies.motion import drawn_axis
 from rigidmd.features.view.figures.space import UP, View, camera, globe, thin_path
 from rigidmd.features.view.figures.style import COOL, FAINT, INK, PALETTE, WARM
-from rigidmd.features.view.kind_display import Animation
-from rigidmd.features.view.page import PagePart, read_asset
+from rigidmd.features.view.page import Animation, PagePart, read_asset
 from rigidmd.mechanics.rotation import from_quaternion
 from rigidmd.run.record import Record
 

@@ -19,20 +19,26 @@ from rigidmd.features.bodies.forces.applied import PythonForce, SteadyForce, Tim
 from rigidmd.features.bodies.forces.resistance import NoResistance, Resistance
 from rigidmd.features.bodies.keys.body import SolidPart, axis_of_symmetry
 from rigidmd.features.bodies.keys.forces import Fluid, Friction, Timed
-from rigidmd.features.bodies.motion import energies
-from rigidmd.features.bodies.step_loop import Body
-from rigidmd.features.bodies.system import BodySystem, Pose
-from rigidmd.formats import format_of
-from rigidmd.mechanics.free_rotor import DrivenRotor, NoRotor, split_rotor
-from rigidmd.mechanics.inertia import (
+from rigidmd.features.bodies.keys.solids import (
     Assembly,
     Part,
     added_mass_of_ellipsoid,
     assemble_solids,
-    inertia_tensor,
-    shifted_inertia,
     solid,
 )
+from rigidmd.features.bodies.motion import energies
+from rigidmd.features.bodies.step_loop import Body
+from rigidmd.features.bodies.system import BodySystem, Pose
+from rigidmd.features.bodies.translation import (
+    FluidTranslation,
+    FreeTranslation,
+    InertialFrame,
+    NoTranslation,
+    RotatingFrame,
+)
+from rigidmd.formats import format_of
+from rigidmd.mechanics.free_rotor import DrivenRotor, NoRotor, split_rotor
+from rigidmd.mechanics.inertia import inertia_tensor, shifted_inertia
 from rigidmd.mechanics.rotation import unit_vector
 from rigidmd.mechanics.time_functions import (
     TimeFunction,
@@ -44,13 +50,6 @@ from rigidmd.mechanics.time_functions import (
     pulse_function,
     sum_functions,
     values_at,
-)
-from rigidmd.mechanics.translation import (
-    FluidTranslation,
-    FreeTranslation,
-    InertialFrame,
-    NoTranslation,
-    RotatingFrame,
 )
 from rigidmd.scene import BodyScene
 from rigidmd.scene.validation import not_none

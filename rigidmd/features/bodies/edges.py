@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rigidmd.features.bodies.keys.solids import SOLIDS
 from rigidmd.formats.bonds import shortest_links
-from rigidmd.mechanics.inertia import SOLIDS
 
 if TYPE_CHECKING:
     from rigidmd.features.bodies.system import BodySystem

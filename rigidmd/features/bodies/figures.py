@@ -8,6 +8,7 @@ import numpy as np
 
 from rigidmd.features.bodies.motion import Motion, drawn_axis
 from rigidmd.features.bodies.system import BodySystem
+from rigidmd.features.bodies.translation import InertialFrame
 from rigidmd.features.view.figures.panels import Panel, Timeline, draw_rows, stack
 from rigidmd.features.view.figures.space import (
     UP,
@@ -20,7 +21,6 @@ from rigidmd.features.view.figures.space import (
 )
 from rigidmd.features.view.figures.style import COOL, FAINT, INK, WARM, new_figure, open_axis
 from rigidmd.mechanics.free_rotor import SplitRotor
-from rigidmd.mechanics.translation import InertialFrame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,10 +8,10 @@ import numpy as np
 
 from rigidmd.features.bodies.assemble import assembled, inertia_at_centre, inertia_of, principal
 from rigidmd.features.bodies.keys.body import EQUAL_MOMENTS, Solid, axis_of_symmetry
+from rigidmd.features.bodies.keys.solids import SOLIDS
 from rigidmd.features.bodies.system import BodySystem
 from rigidmd.features.view.figures.space import camera
 from rigidmd.formats.bonds import shortest_links
-from rigidmd.mechanics.inertia import SOLIDS
 
 #: Corners of a circle; least thickness of a body, as a fraction of its reach.
 CIRCLE_CORNERS, MIN_THICKNESS = 24, 0.02

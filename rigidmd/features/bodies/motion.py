@@ -16,10 +16,10 @@ from rigidmd.features.bodies.forces.applied import (
 )
 from rigidmd.features.bodies.forces.resistance import NoResistance
 from rigidmd.features.bodies.system import BodySystem
+from rigidmd.features.bodies.translation import FluidTranslation, InertialFrame, inertial_masses
 from rigidmd.mechanics.free_rotor import DrivenRotor
 from rigidmd.mechanics.rotation import to_euler_angles, to_quaternion, unit_vector
 from rigidmd.mechanics.time_functions import is_constant_function
-from rigidmd.mechanics.translation import FluidTranslation, InertialFrame, inertial_masses
 
 
 class Family(NamedTuple):

@@ -11,8 +11,8 @@ from rigidmd.features.bodies.keys.body import EQUAL_MOMENTS
 from rigidmd.features.bodies.motion import Motion
 from rigidmd.features.bodies.system import BodySystem
 from rigidmd.features.bodies.theory import free_body_period, heavy_top_motion
+from rigidmd.features.bodies.translation import FluidTranslation, InertialFrame
 from rigidmd.mechanics.free_rotor import SplitRotor
-from rigidmd.mechanics.translation import FluidTranslation, InertialFrame
 
 #: Minimum samples of a motion, and of each period in it.
 LEAST_SAMPLES, SAMPLES_PER_PERIOD = 16, 8

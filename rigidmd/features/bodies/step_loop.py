@@ -15,6 +15,17 @@ from rigidmd.dynamics.force_gradient import (
     evaluate,
 )
 from rigidmd.features.bodies.forces.resistance import NoResistance, Resistance, kick_with_resistance
+from rigidmd.features.bodies.translation import (
+    FluidTranslation,
+    FreeTranslation,
+    InertialFrame,
+    NoTranslation,
+    RotatingFrame,
+    frame_rate,
+    inertial_mass,
+    rotate_with_frame,
+    translate,
+)
 from rigidmd.forces.terms import compute_body_load, total_power, trait
 from rigidmd.mechanics.free_rotor import (
     ORTHOGONALITY_INTERVAL,
@@ -26,20 +37,7 @@ from rigidmd.mechanics.free_rotor import (
     restore_orthogonality,
     rotate_by_vector,
 )
-from rigidmd.mechanics.translation import (
-    FluidTranslation,
-    FreeTranslation,
-    InertialFrame,
-    NoTranslation,
-    RotatingFrame,
-    body_component,
-    body_vector,
-    frame_rate,
-    inertial_mass,
-    lab_vector,
-    rotate_with_frame,
-    translate,
-)
+from rigidmd.mechanics.vectors import body_component, body_vector, lab_vector
 
 #: Indices of the progress of a step: flows done; whether the load belongs to the current positions
 #: (1), and the load of a kick with gradient too (2).

@@ -17,7 +17,8 @@ from rigidmd.core.files import atomic_file
 from rigidmd.errors import OutputError
 from rigidmd.features.view.figures.panels import draw_rows
 from rigidmd.features.view.figures.style import COLORS, INK, WARM, new_figure
-from rigidmd.features.view.kind_display import Animation, display_of, panels, timeline
+from rigidmd.features.view.kind_display import display_of, panels, timeline
+from rigidmd.features.view.page import Animation
 from rigidmd.run.record import Record, read_record
 from rigidmd.scene.validation import not_none
 

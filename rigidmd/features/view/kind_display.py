@@ -13,39 +13,14 @@ from rigidmd.run.kind import kind_of
 from rigidmd.scene import Scene
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
     from rigidmd.engines.samples import Samples
     from rigidmd.engines.system import System
     from rigidmd.features.view.figures.panels import Panel, Timeline
     from rigidmd.features.view.figures.picture import Picture
-    from rigidmd.features.view.page import PagePart
+    from rigidmd.features.view.page import Animation
     from rigidmd.run.record import Record
     from rigidmd.run.results import Results
     from rigidmd.run.simulation import Simulation
-
-
-class Animation:
-    """The animation of a run."""
-
-    time: np.ndarray  # (t,)
-    notes: list[str]
-
-    def draw(self, axes: "Axes", time: float) -> None:
-        """Draw the picture at a time."""
-        raise NotImplementedError
-
-    def page_part(self) -> "PagePart":
-        """Its part of a page."""
-        raise NotImplementedError
-
-    def loop_end(self) -> tuple[float, list[str]]:
-        """The time at which a file ends, and notes on it."""
-        raise NotImplementedError
-
-    def film_notes(self, step: float, seconds: float) -> list[str]:
-        """Notes on a file with pictures at intervals of `step` that lasts for some seconds."""
-        raise NotImplementedError
 
 
 SystemT = TypeVar("SystemT", bound=AnySystem)
@@ -77,14 +52,14 @@ class KindDisplay(ABC, Generic[SystemT, SamplesT]):
         """The panels of a run that its columns allow."""
 
     @abstractmethod
-    def animation(self, record: "Record", most_frames: int | None = None) -> Animation:
+    def animation(self, record: "Record", most_frames: int | None = None) -> "Animation":
         """The animation of a stored run. Raises OutputError.
 
         most_frames : default: as many as a page holds
         """
 
     @abstractmethod
-    def animation_in_memory(self, results: "Results", record: "Record") -> Animation:
+    def animation_in_memory(self, results: "Results", record: "Record") -> "Animation":
         """The animation of results, for a notebook. Raises OutputError."""
 
     @abstractmethod
@@ -129,12 +104,12 @@ class MolecularDisplay(KindDisplay["System", "Samples"]):
 
         return molecular_panels(system, columns)
 
-    def animation(self, record: "Record", most_frames: int | None = None) -> Animation:
+    def animation(self, record: "Record", most_frames: int | None = None) -> "Animation":
         from rigidmd.features.view.molecule_animation import MoleculeAnimation
 
         return MoleculeAnimation(record, most_frames)
 
-    def animation_in_memory(self, results: "Results", record: "Record") -> Animation:
+    def animation_in_memory(self, results: "Results", record: "Record") -> "Animation":
         from rigidmd.features.view.molecule_animation import (
             MoleculeAnimation,
             chemiscope_script,

@@ -14,9 +14,8 @@ from rigidmd.engines.sites import Sites
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError
 from rigidmd.features.view.figures.space import View, camera
-from rigidmd.features.view.kind_display import Animation
 from rigidmd.features.view.molecule_figure import color_of
-from rigidmd.features.view.page import PagePart, read_asset
+from rigidmd.features.view.page import Animation, PagePart, read_asset
 from rigidmd.features.view.solids import DEFAULT_RADIUS, SPHERE_SCALE, solids_of
 from rigidmd.formats.bonds import COVALENT, connections
 from rigidmd.io.trajectory import Frames, read_frames

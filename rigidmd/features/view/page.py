@@ -7,11 +7,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
 from rigidmd.core.files import write_text
 from rigidmd.core.toml import Json
 from rigidmd.features.view.figures.style import DARK_PALETTE, FAINT, PALETTE, curve_style, drawing
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
     from rigidmd.features.view.figures.picture import Picture
 
 #: Classes of a verdict: what is good, what to look at, what is wrong.
@@ -38,6 +42,29 @@ class PagePart(NamedTuple):
     usage: str  # how to use it
     data: Json  # for the scripts: JSON values and arrays
     scripts: list[str]
+
+
+class Animation:
+    """The animation of a run."""
+
+    time: np.ndarray  # (t,)
+    notes: list[str]
+
+    def draw(self, axes: "Axes", time: float) -> None:
+        """Draw the picture at a time."""
+        raise NotImplementedError
+
+    def page_part(self) -> PagePart:
+        """Its part of a page."""
+        raise NotImplementedError
+
+    def loop_end(self) -> tuple[float, list[str]]:
+        """The time at which a file ends, and notes on it."""
+        raise NotImplementedError
+
+    def film_notes(self, step: float, seconds: float) -> list[str]:
+        """Notes on a file with pictures at intervals of `step` that lasts for some seconds."""
+        raise NotImplementedError
 
 
 def page(title: str, parts: Iterable[str], style: str = "") -> str:

@@ -15,11 +15,12 @@ import numpy as np
 
 from rigidmd.features import providers
 from rigidmd.features.view import plots
-from rigidmd.features.view.kind_display import Animation, display_of
+from rigidmd.features.view.kind_display import display_of
 from rigidmd.features.view.page import (
     BAD,
     DOUBTFUL,
     GOOD,
+    Animation,
     Raw,
     code,
     items,

@@ -16,7 +16,7 @@ from rigidmd.core.plain_text import vector_text
 from rigidmd.core.state import NOW, OK
 from rigidmd.forces.parts import SystemParts
 from rigidmd.forces.terms import add_forces, energy_rate
-from rigidmd.mechanics.translation import body_component, body_vector
+from rigidmd.mechanics.vectors import body_component, body_vector
 from rigidmd.scene.fields import Fields
 from rigidmd.scene.validation import not_none
 from rigidmd.units import VOLT_PER_NM

@@ -22,7 +22,7 @@ from rigidmd.compile import (
 from rigidmd.compile.simd import lane_count, lanes_of, load_scalar
 from rigidmd.core.state import State
 from rigidmd.forces.terms import TALLIED, Evaluation
-from rigidmd.mechanics.translation import body_vector, lab_vector
+from rigidmd.mechanics.vectors import body_vector, lab_vector
 
 # Up to this number, loops over molecules run on one thread: they take a few microseconds.
 SERIAL_MOLECULES = 128

@@ -16,9 +16,9 @@ from rigidmd.features.bodies.assemble import build_body
 from rigidmd.features.bodies.cpu_engine import BodyEngine
 from rigidmd.features.bodies.forces.applied import SteadyForce
 from rigidmd.features.bodies.step_loop import Body
+from rigidmd.features.bodies.translation import NoTranslation
 from rigidmd.mechanics.free_rotor import split_rotor
 from rigidmd.mechanics.rotation import from_vector, hat, random_rotations
-from rigidmd.mechanics.translation import NoTranslation
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 

@@ -14,9 +14,9 @@ from rigidmd.core.state import state_of
 from rigidmd.errors import SimulationError
 from rigidmd.features.bodies.cpu_engine import BodyEngine
 from rigidmd.features.bodies.step_loop import Body
+from rigidmd.features.bodies.translation import NoTranslation
 from rigidmd.mechanics.free_rotor import ExactRotor, rotate, split_rotor
 from rigidmd.mechanics.rotation import from_vector, orthogonality_error, random_rotations
-from rigidmd.mechanics.translation import NoTranslation
 from rigidmd.run import Simulation
 from rigidmd.scene import BodyScene, Scene
 

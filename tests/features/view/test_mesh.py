@@ -7,8 +7,9 @@ from support.common import ROOT
 from rigidmd import Scene, Simulation
 from rigidmd.commands import cli
 from rigidmd.features.bodies.assemble import build_body
+from rigidmd.features.bodies.keys.solids import SOLIDS, solid
 from rigidmd.features.bodies.mesh import UNITS, mesh_of
-from rigidmd.mechanics.inertia import SOLIDS, shifted_inertia, solid
+from rigidmd.mechanics.inertia import shifted_inertia
 
 
 def volume(mesh):

@@ -10,7 +10,7 @@ from rigidmd.compile import implements, kernel
 from rigidmd.core.state import NEEDS_PYTHON_FORCES, OK, State
 from rigidmd.forces.terms import Setup, add_forces, power
 from rigidmd.mechanics.time_functions import TimeFunction, value
-from rigidmd.mechanics.translation import body_component, body_vector
+from rigidmd.mechanics.vectors import body_component, body_vector
 
 
 class SteadyForce(NamedTuple):

@@ -31,10 +31,9 @@ from rigidmd.features.bodies.keys.forces import (
     PositiveVector,
     Wheel,
 )
+from rigidmd.features.bodies.keys.solids import COMPONENTS_PER_DIMENSION, SOLIDS
 from rigidmd.formats import BODY_TOPOLOGY, TRAJECTORY
 from rigidmd.mechanics.inertia import (
-    COMPONENTS_PER_DIMENSION,
-    SOLIDS,
     inertia_error,
     shifted_inertia,
 )

@@ -25,7 +25,7 @@ from rigidmd.features.potentials.poses.pair_list import (
 )
 from rigidmd.forces.neighbors.sites import blocks_of, molecules_of_block
 from rigidmd.forces.terms import FORCES_ONLY, TALLIED, Evaluation, Setup
-from rigidmd.mechanics.translation import body_vector, lab_vector
+from rigidmd.mechanics.vectors import body_vector, lab_vector
 
 #: The skin is at most this fraction of the cutoff.
 LONGEST_SKIN = 0.5

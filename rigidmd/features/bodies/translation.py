@@ -10,6 +10,7 @@ import numpy as np
 from rigidmd.compile import chosen_by_type, is_a, kernel
 from rigidmd.mechanics.free_rotor import rotate_body, rotate_vector, sine_and_versine
 from rigidmd.mechanics.time_functions import TimeFunction, value
+from rigidmd.mechanics.vectors import body_component
 
 
 class FreeTranslation(NamedTuple):
@@ -70,33 +71,6 @@ def translate_in_fluid(translation, state, h):
     state.angular_momentum_body[0, 0] += h * (p1 * v2 - p2 * v1)
     state.angular_momentum_body[0, 1] += h * (p2 * v0 - p0 * v2)
     state.angular_momentum_body[0, 2] += h * (p0 * v1 - p1 * v0)
-
-
-@kernel(inline=True)
-def body_component(rotation, vector_lab, k):
-    """Component of a lab vector (3,) along body axis k."""
-    return (
-        rotation[0, k] * vector_lab[0]
-        + rotation[1, k] * vector_lab[1]
-        + rotation[2, k] * vector_lab[2]
-    )
-
-
-@kernel(inline=True)
-def body_vector(rotation, vector_lab):
-    """The components of a lab vector (3,) along the body axes."""
-    q, v = rotation, vector_lab
-    return body_component(q, v, 0), body_component(q, v, 1), body_component(q, v, 2)
-
-
-@kernel(inline=True)
-def lab_vector(rotation, x, y, z):
-    """The components along the lab axes of a vector with components x, y, z along the body axes."""
-    return (
-        rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
-        rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z,
-        rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z,
-    )
 
 
 @chosen_by_type(inline=True)

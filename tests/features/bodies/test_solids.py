@@ -9,8 +9,9 @@ from scipy.special import elliprd
 from support.common import ROOT
 
 from rigidmd.features.bodies.assemble import build_body
-from rigidmd.mechanics.inertia import COMPONENTS_PER_DIMENSION as NUMBERS
-from rigidmd.mechanics.inertia import SOLIDS, added_mass_of_ellipsoid, inertia_tensor, solid
+from rigidmd.features.bodies.keys.solids import COMPONENTS_PER_DIMENSION as NUMBERS
+from rigidmd.features.bodies.keys.solids import SOLIDS, added_mass_of_ellipsoid, solid
+from rigidmd.mechanics.inertia import inertia_tensor
 from rigidmd.scene import Scene
 
 MASS = 2.5
