@@ -7,8 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import chosen_by_type, is_a, kernel
-from rigidmd.core.state import WORK
-from rigidmd.mechanics.time_functions import TimeFunction, rate, value
 
 #: Steps between two corrections of the rounding errors of QᵀQ. They would grow, and with them the
 #: error of the total torque: a step of two waters had one of 5e-14 of the forces after 1e3 steps
@@ -84,15 +82,6 @@ def _symmetry(moments: np.ndarray) -> int:
     if len(set(moments[moments > 0])) <= 1:
         return SPHERICAL
     return next((k for k in range(3) if moments[k - 1] == moments[k - 2]), NO_SYMMETRY)
-
-
-class DrivenRotor(NamedTuple):
-    """A single body with wheels or a changing inertia, with L = I(t) omega + h(t): see the theory
-    chapter `bodies`. I and h are evaluated at the middle of each time interval. The changes of H
-    with them are computed exactly, as work done on the body."""
-
-    inertia: TimeFunction
-    momentum: TimeFunction
 
 
 class NoRotor(NamedTuple):
@@ -330,76 +319,3 @@ def restore_orthogonality(rotation, momentum):
             q[i, 0] = x - 0.5 * (x * xx + y * xy + z * zx)
             q[i, 1] = y - 0.5 * (x * xy + y * yy + z * yz)
             q[i, 2] = z - 0.5 * (x * zx + y * yz + z * zz)
-
-
-@chosen_by_type(inline=True)
-def rotate_body(rotor, state, time, h):
-    """Rotate a single body freely from `time` to time + h, in place."""
-    if not is_a(rotor, DrivenRotor):
-        return lambda rotor, state, time, h: rotate(
-            rotor, 0, state.rotation, state.angular_momentum_body, 0, h
-        )
-
-    def rotate_driven(rotor, state, time, h):
-        L, inertia, carried = state.angular_momentum_body, rotor.inertia, rotor.momentum
-        before = driven_energy(rotor, L, time)
-        middle = time + 0.5 * h
-        inverse = (
-            1 / value(inertia, middle, 0),
-            1 / value(inertia, middle, 1),
-            1 / value(inertia, middle, 2),
-        )
-        offset = value(carried, middle, 0), value(carried, middle, 1), value(carried, middle, 2)
-        state.energy_ledger[WORK] += driven_energy(rotor, L, middle) - before
-        rotate_about_axes(state.rotation, L, 0, (0, 1, 2), inverse, offset, h)
-        state.energy_ledger[WORK] += driven_energy(rotor, L, time + h) - driven_energy(
-            rotor, L, middle
-        )
-
-    return rotate_driven
-
-
-@kernel
-def driven_energy(rotor, angular_momentum_body, time):
-    """sum (L_k - h_k)²/(2 I_k) at a time."""
-    energy = 0.0
-    for k in range(3):
-        L = angular_momentum_body[0, k] - value(rotor.momentum, time, k)
-        energy += 0.5 * L * L / value(rotor.inertia, time, k)
-    return energy
-
-
-@chosen_by_type(inline=True)
-def moments(rotor, time, k):
-    """(1/I_k, h_k) of a single body's rotor at a time, 1/I_k is 0 for an axis without inertia."""
-    if is_a(rotor, DrivenRotor):
-        return lambda rotor, time, k: (
-            1 / value(rotor.inertia, time, k),
-            value(rotor.momentum, time, k),
-        )
-    if is_a(rotor, NoRotor):
-        return lambda rotor, time, k: (0.0, 0.0)
-    return lambda rotor, time, k: (rotor.inverse_inertia[0, k], 0.0)
-
-
-@chosen_by_type(inline=True)
-def moment_rates(rotor, time, k):
-    """(I_k, I_k', h_k, h_k') of a single body's rotor at a time."""
-    if is_a(rotor, DrivenRotor):
-
-        def driven(rotor, time, k):
-            inertia, carried = rotor.inertia, rotor.momentum
-            return (
-                value(inertia, time, k),
-                rate(inertia, time, k),
-                value(carried, time, k),
-                rate(carried, time, k),
-            )
-
-        return driven
-
-    def constant(rotor, time, k):
-        inverse, carried = moments(rotor, time, k)
-        return (1 / inverse if inverse > 0 else 0.0), 0.0, carried, 0.0
-
-    return constant

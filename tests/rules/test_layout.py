@@ -38,9 +38,9 @@ TESTED_BY = {
     "mechanics/test_free_rotor.py": "mechanics/inertia mechanics/vectors",
     "features/bodies/test_engine.py": "features/bodies/assemble features/bodies/defaults"
     " features/bodies/step_loop features/bodies/motion features/bodies/system features/bodies/cpu_engine"
-    " features/bodies/forces/applied features/bodies/translation",
+    " features/bodies/forces/applied features/bodies/translation features/bodies/driven_rotor",
     "features/bodies/test_fluid.py": "features/bodies/forces/resistance",
-    "features/bodies/test_frames.py": "mechanics/time_functions",
+    "features/bodies/test_frames.py": "features/bodies/time_functions",
     "features/bodies/test_input.py": "features/bodies/keys/body features/bodies/keys/forces features/bodies/describe",
     "features/bodies/test_ode.py": "features/bodies/ode/odes",
     "features/bodies/test_rates.py": "features/bodies/rates features/bodies/summary features/bodies/theory features/bodies/elliptic",

@@ -15,6 +15,7 @@ from rigidmd.features.bodies.defaults import (
     body_with_defaults,
     check_memory_of_samples,
 )
+from rigidmd.features.bodies.driven_rotor import DrivenRotor
 from rigidmd.features.bodies.forces.applied import PythonForce, SteadyForce, TimeDependentForce
 from rigidmd.features.bodies.forces.resistance import NoResistance, Resistance
 from rigidmd.features.bodies.keys.body import SolidPart, axis_of_symmetry
@@ -29,18 +30,7 @@ from rigidmd.features.bodies.keys.solids import (
 from rigidmd.features.bodies.motion import energies
 from rigidmd.features.bodies.step_loop import Body
 from rigidmd.features.bodies.system import BodySystem, Pose
-from rigidmd.features.bodies.translation import (
-    FluidTranslation,
-    FreeTranslation,
-    InertialFrame,
-    NoTranslation,
-    RotatingFrame,
-)
-from rigidmd.formats import format_of
-from rigidmd.mechanics.free_rotor import DrivenRotor, NoRotor, split_rotor
-from rigidmd.mechanics.inertia import inertia_tensor, shifted_inertia
-from rigidmd.mechanics.rotation import unit_vector
-from rigidmd.mechanics.time_functions import (
+from rigidmd.features.bodies.time_functions import (
     TimeFunction,
     constant_function,
     has_constant_direction,
@@ -51,6 +41,17 @@ from rigidmd.mechanics.time_functions import (
     sum_functions,
     values_at,
 )
+from rigidmd.features.bodies.translation import (
+    FluidTranslation,
+    FreeTranslation,
+    InertialFrame,
+    NoTranslation,
+    RotatingFrame,
+)
+from rigidmd.formats import format_of
+from rigidmd.mechanics.free_rotor import NoRotor, split_rotor
+from rigidmd.mechanics.inertia import inertia_tensor, shifted_inertia
+from rigidmd.mechanics.rotation import unit_vector
 from rigidmd.scene import BodyScene
 from rigidmd.scene.validation import not_none
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from rigidmd.core.state import WORK, State
 from rigidmd.engines.samples import MATRIX, Column, SampleTable
+from rigidmd.features.bodies.driven_rotor import DrivenRotor
 from rigidmd.features.bodies.forces.applied import (
     PythonForce,
     SteadyForce,
@@ -16,10 +17,9 @@ from rigidmd.features.bodies.forces.applied import (
 )
 from rigidmd.features.bodies.forces.resistance import NoResistance
 from rigidmd.features.bodies.system import BodySystem
+from rigidmd.features.bodies.time_functions import is_constant_function
 from rigidmd.features.bodies.translation import FluidTranslation, InertialFrame, inertial_masses
-from rigidmd.mechanics.free_rotor import DrivenRotor
 from rigidmd.mechanics.rotation import to_euler_angles, to_quaternion, unit_vector
-from rigidmd.mechanics.time_functions import is_constant_function
 
 
 class Family(NamedTuple):

@@ -14,6 +14,7 @@ from rigidmd.dynamics.force_gradient import (
     displace,
     evaluate,
 )
+from rigidmd.features.bodies.driven_rotor import DrivenRotor, moments
 from rigidmd.features.bodies.forces.resistance import NoResistance, Resistance, kick_with_resistance
 from rigidmd.features.bodies.translation import (
     FluidTranslation,
@@ -29,11 +30,9 @@ from rigidmd.features.bodies.translation import (
 from rigidmd.forces.terms import compute_body_load, total_power, trait
 from rigidmd.mechanics.free_rotor import (
     ORTHOGONALITY_INTERVAL,
-    DrivenRotor,
     ExactRotor,
     NoRotor,
     SplitRotor,
-    moments,
     restore_orthogonality,
     rotate_by_vector,
 )

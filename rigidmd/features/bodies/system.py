@@ -13,14 +13,14 @@ from rigidmd.core.state_file import array_errors
 from rigidmd.engines.sites import Sites
 from rigidmd.errors import SimulationError
 from rigidmd.features.bodies.cpu_engine import BodyEngine
+from rigidmd.features.bodies.driven_rotor import DrivenRotor
 from rigidmd.features.bodies.forces.resistance import NoResistance
 from rigidmd.features.bodies.keys.body import FORMULATION, SAMPLES
 from rigidmd.features.bodies.step_loop import Body
+from rigidmd.features.bodies.time_functions import TimeFunction, piece_at, values_at
 from rigidmd.features.bodies.translation import FluidTranslation, InertialFrame
 from rigidmd.forces.neighbors.space import Unbounded
-from rigidmd.mechanics.free_rotor import DrivenRotor
 from rigidmd.mechanics.inertia import BodyKind, kind_of_body
-from rigidmd.mechanics.time_functions import TimeFunction, piece_at, values_at
 from rigidmd.scene import BodyScene
 from rigidmd.scene.validation import not_none, number_of_steps
 

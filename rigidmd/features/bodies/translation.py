@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import chosen_by_type, is_a, kernel
-from rigidmd.mechanics.free_rotor import rotate_body, rotate_vector, sine_and_versine
-from rigidmd.mechanics.time_functions import TimeFunction, value
+from rigidmd.features.bodies.driven_rotor import rotate_body
+from rigidmd.features.bodies.time_functions import TimeFunction, value
+from rigidmd.mechanics.free_rotor import rotate_vector, sine_and_versine
 from rigidmd.mechanics.vectors import body_component
 
 

@@ -8,14 +8,14 @@ from support.common import same_bits
 from support.scenes import PINNED
 
 from rigidmd.errors import SceneError
+from rigidmd.features.bodies.time_functions import constant_function as steady
+from rigidmd.features.bodies.time_functions import integrate_function as integral
+from rigidmd.features.bodies.time_functions import interpolated_function as table
+from rigidmd.features.bodies.time_functions import is_constant_function as is_steady
+from rigidmd.features.bodies.time_functions import pulse_function as window
+from rigidmd.features.bodies.time_functions import sum_functions as total
+from rigidmd.features.bodies.time_functions import values_at as value_at
 from rigidmd.mechanics.rotation import from_vector
-from rigidmd.mechanics.time_functions import constant_function as steady
-from rigidmd.mechanics.time_functions import integrate_function as integral
-from rigidmd.mechanics.time_functions import interpolated_function as table
-from rigidmd.mechanics.time_functions import is_constant_function as is_steady
-from rigidmd.mechanics.time_functions import pulse_function as window
-from rigidmd.mechanics.time_functions import sum_functions as total
-from rigidmd.mechanics.time_functions import values_at as value_at
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from rigidmd.compile import implements, kernel
 from rigidmd.core.state import NEEDS_PYTHON_FORCES, OK, State
+from rigidmd.features.bodies.time_functions import TimeFunction, value
 from rigidmd.forces.terms import Setup, add_forces, power
-from rigidmd.mechanics.time_functions import TimeFunction, value
 from rigidmd.mechanics.vectors import body_component, body_vector
 
 

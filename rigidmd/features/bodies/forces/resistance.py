@@ -9,8 +9,9 @@ import numpy as np
 
 from rigidmd.compile import chosen_by_type, is_a, kernel
 from rigidmd.core.state import WORK
+from rigidmd.features.bodies.driven_rotor import moments
 from rigidmd.features.bodies.translation import NoTranslation, frame_rate, inertial_mass
-from rigidmd.mechanics.free_rotor import NoRotor, moments
+from rigidmd.mechanics.free_rotor import NoRotor
 from rigidmd.mechanics.vectors import body_component, body_vector
 
 MAX_ITERATIONS = 100  # for |v|; about six are needed
