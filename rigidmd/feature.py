@@ -38,7 +38,8 @@ class Row:
     #: one value. A scene in which one has a value uses the feature
     keys: tuple[str, ...] = ()
     file_keys: str = ""  # pattern of its keys that name a file
-    acts: bool = False  # whether it changes systems: a scene that uses it cannot do without
+    acts: bool = False  # whether it changes the systems of scenes that use it
+    is_optional: bool = False  # whether these run without it, with fewer files
     #: Methods of its `Feature` that are called by their name, and not for scenes with its keys
     provides: tuple[str, ...] = ()
     #: Kind of scenes that it adds, by the table that only these have, such as "body". A module of
@@ -80,7 +81,10 @@ class Row:
         )
 
     def load(self, needed_by: str = "this"):
-        """Its `Feature`. Raises MissingFeatureError."""
+        """Its `Feature`, which adds nothing without a module `feature`. Raises
+        MissingFeatureError."""
+        if self.is_installed and find_spec(f"{self.package}.feature") is None:
+            return Feature()
         return self.module("feature", needed_by).FEATURE
 
 

@@ -1,7 +1,6 @@
 """The list of features, in names and words: importing it loads none of them."""
 
 from collections.abc import Iterator, Mapping
-from operator import attrgetter
 
 from rigidmd.feature import Feature, Row
 
@@ -21,6 +20,7 @@ FEATURES = (
         "export to LAMMPS, OpenMM and GROMACS, and runs with them",
         needs=("crystals", "potentials"),
         commands=("export", "verify"),
+        keys=("engine.name=lammps", "engine.name=openmm"),
         programs=("gromacs", "lammps", "openmm"),
     ),
     Row(
@@ -66,6 +66,7 @@ FEATURES = (
     Row(
         "monte_carlo",
         "hybrid Monte Carlo",
+        keys=("stages.thermostat=hybrid_monte_carlo",),
         thermostats=("keys",),
         columns=(
             ("acceptance", "Acceptance", "1", f"fraction of {_ENDED} that was accepted"),
@@ -90,6 +91,7 @@ FEATURES = (
         commands=("film", "report", "view"),
         display="notebook",
         keys=("output.figures",),
+        is_optional=True,
         provides=("draw_model",),
     ),
 )
@@ -120,7 +122,9 @@ def acting_on(scene: object) -> list[Feature]:
 def check_installed(tables: Mapping, source: str) -> None:
     """Raise MissingFeatureError if a scene with these tables needs a feature that is absent."""
     rows = {row.name: row for row in FEATURES}
-    for row in filter(attrgetter("acts"), FEATURES):
+    for row in FEATURES:
+        if row.is_optional:
+            continue
         absent = [name for name in (row.name, *row.needs) if not rows[name].is_installed]
         keys = [key for key in row.keys if absent and _has(tables, *key.partition("=")[::2])]
         if keys:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
-from rigidmd.features import modules
+from rigidmd.features import FEATURES, modules
 from rigidmd.formats.atoms import Atoms, Frame
 from rigidmd.formats.systems import Placed
 
@@ -137,8 +137,13 @@ def find_modules() -> None:
 
 
 def format_of(path: str | Path) -> Format | None:
-    """The format of a file by its extension. None for one that only ASE may know, or nobody."""
-    return BY_EXTENSION.get(Path(path).suffix.lower())
+    """The format of a file by its extension. None for one that only ASE may know, or nobody.
+    Raises MissingFeatureError for one of a feature that is absent."""
+    extension = Path(path).suffix.lower()
+    for row in FEATURES:
+        if extension[1:] in row.formats and not row.is_installed:
+            raise row.missing(str(path))
+    return BY_EXTENSION.get(extension)
 
 
 def has_types(path: str | Path) -> bool:

@@ -18,8 +18,10 @@ WATER += ["--set", "stages.production.duration_ps=0.02"]
 NEEDING = {
     "analysis": ["analyse", "run"],
     "bodies": ["check", "systems/heavy_top_3.toml"],
+    "crystals": ["check", "systems/lta.toml"],
     "external": ["verify", "systems/water.toml"],
     "free_energy": ["virial", "spce"],
+    "monte_carlo": ["check", *WATER, "--set", "stages.1.thermostat=hybrid_monte_carlo"],
     "potentials": ["check", "systems/gay_berne.toml"],
     "studies": ["sweep", "systems/water.toml"],
     "view": ["report", "run"],
