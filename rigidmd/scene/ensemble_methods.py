@@ -110,12 +110,12 @@ class Thermostat(EnsembleMethod):
         return f"rigidmd.dynamics.thermostats.{self.name}"
 
     def time(self, values: Values) -> float:
-        """Its time constant, ps."""
-        return values["thermostat_time_ps"]
+        """Its time constant, ps. 0 for one that acts at once."""
+        return values.get("thermostat_time_ps", 0.0)
 
     def describe(self, values: Values) -> str:
-        """What reports print after its name."""
-        return f"{values['thermostat_time_ps']:g} ps"
+        """What reports print after its name. By default its time constant."""
+        return f"{time:g} ps" if (time := self.time(values)) else ""
 
     def joined(self, scheme: Scheme, thermostat: tuple, stage: StageKeys) -> Scheme:
         """A scheme with its flow. thermostat : its record, see `dynamics.thermostats`"""
