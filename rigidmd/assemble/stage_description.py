@@ -56,8 +56,8 @@ def describe_stage(stage: Stage) -> list[str]:
         text = f"{stage.label}: {stage.duration_ps:g} ps, {choice}"
     if stage.has_thermostat:
         kind = stage.thermostat_method
-        described = kind.describe(stage.thermostat_values)
-        text += f", {_ramp(stage.temperatures)} K by {kind.title}, {described}"
+        words = [kind.title, kind.describe(stage.thermostat_values)]
+        text += f", {_ramp(stage.temperatures)} K by {', '.join(filter(None, words))}"
     if stage.has_barostat:
         text += f", {_barostat(stage)}"
     if stage.volume:

@@ -70,25 +70,30 @@ def test_the_list_names_folders_their_needs_and_their_methods():
         assert {*row.commands} == {path.stem for path in commands.glob("[a-z]*.py")}
 
 
-#: Features without which the core does not work yet.
-ENTANGLED = ("monte_carlo",)
+@pytest.mark.parametrize("name", NEEDING)
+def test_what_needs_an_absent_feature_names_it(name, tmp_path):
+    folder = without(tmp_path, name)
+    (folder / "run").mkdir()
+    code, text = run(folder, *NEEDING[name])
+    assert code == 2, text
+    assert len(text.splitlines()) == 1, text
+    assert f"needs the feature {name} (" in text
 
 
-@pytest.mark.parametrize(
-    "name", [name for name in [*NAMES, "all"] if name not in (*ENTANGLED, "all")]
-)
+def test_water_is_checked_without_any_feature(tmp_path):
+    folder = without(tmp_path, *NAMES)
+    code, text = run(folder, "check", *WATER)
+    assert code == 0, text
+    code, text = run(folder, "--help")
+    assert code == 0
+    commands = {command for row in FEATURES for command in row.commands}
+    assert not [line for line in text.splitlines() if line.split()[:1] in [[c] for c in commands]]
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("name", [*NAMES, "all"])
 def test_water_runs_without_a_feature(name, tmp_path):
-    hidden = NAMES if name == "all" else [name]
-    folder = without(tmp_path, *hidden)
+    folder = without(tmp_path, *(NAMES if name == "all" else [name]))
     code, text = run(folder, "run", *WATER, "-o", "run")
     assert code == 0, text
     assert (folder / "run" / "summary.json").is_file()
-    code, text = run(folder, "--help")
-    assert code == 0
-    commands = {command for row in FEATURES if row.name in hidden for command in row.commands}
-    assert not [line for line in text.splitlines() if line.split()[:1] in [[c] for c in commands]]
-    if name in NEEDING:
-        code, text = run(folder, *NEEDING[name])
-        assert code == 2, text
-        assert len(text.splitlines()) == 1, text
-        assert f"needs the feature {name} (" in text
