@@ -10,7 +10,7 @@ FEATURES = (
     Row(
         "bodies",
         "a single rigid body: tops, gyroscopes, bodies in a fluid, satellites",
-        needs=("potentials", "studies", "view"),
+        needs=("studies", "view"),
         kind="body",
         kind_title="one body",
         commands=("gallery",),

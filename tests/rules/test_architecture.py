@@ -166,6 +166,12 @@ def test_a_feature_imports_those_that_it_needs():
         and other not in NAMES[name].needs
     ]
     assert not errors, "\n".join(errors)
+    needed = {
+        (feature_of(module_of(path)), feature_of(module.removeprefix("rigidmd.")))
+        for path in FILES
+        for _, module in imports(path)
+    }
+    assert {(name, other) for name, row in NAMES.items() for other in row.needs} <= needed
 
 
 def test_every_kind_of_upward_import_is_found():
