@@ -133,10 +133,6 @@ def upward(package, found):
             yield f"{line}: imports {module}: {package} is below {other.replace('__init__', 'rigidmd')}"
 
 
-#: Files of the core that import a feature.
-REACHING_UP = ()
-
-
 def test_imports_point_down():
     """Imports inside functions and for type checkers count. The order of layers excludes circles of
     packages, and imports of a feature by the core."""
@@ -145,15 +141,8 @@ def test_imports_point_down():
         f"{name_of(path)}:{message}"
         for path in FILES
         for message in upward(package_of(path), imports(path))
-        if name_of(path) not in REACHING_UP
     ]
     assert not errors, "\n".join(errors)
-    assert not [name for name in REACHING_UP if not list(upward_of(name))], "no more reach up"
-
-
-def upward_of(name):
-    path = PACKAGE / name
-    return upward(package_of(path), imports(path))
 
 
 def test_a_feature_imports_those_that_it_needs():
