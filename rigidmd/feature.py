@@ -84,7 +84,7 @@ class Row:
         """Its `Feature`, which adds nothing without a module `feature`. Raises
         MissingFeatureError."""
         if self.is_installed and find_spec(f"{self.package}.feature") is None:
-            return Feature()
+            return import_module(__name__).FEATURE
         return self.module("feature", needed_by).FEATURE
 
 
@@ -187,3 +187,6 @@ class Feature:
     def compare_start(self, system: object, state: object, other: object) -> None:
         """Compare rigidmd with the engine of a program at the start. Raises EngineError."""
         raise NotImplementedError
+
+
+FEATURE = Feature()  # of folders without a module `feature`
