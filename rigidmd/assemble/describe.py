@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.build import build
 from rigidmd.assemble.memory_check import bytes_of
 from rigidmd.assemble.stage_description import describe_stage
 from rigidmd.assemble.start import output_errors, rest_errors
@@ -21,7 +20,6 @@ from rigidmd.forces.neighbors.space import cell_of
 from rigidmd.forces.potentials.coulomb import ReactionField
 from rigidmd.formats.cells import right_angled
 from rigidmd.mechanics.free_rotor import NoRotor
-from rigidmd.scene import MolecularScene
 from rigidmd.scene.molecules import name_of
 from rigidmd.units import BAR, KJ_PER_MOL
 
@@ -36,11 +34,6 @@ PRECISIONS = {
         " double"
     ),
 }
-
-
-def describe(scene: MolecularScene, user_code: bool = True) -> str:
-    """How a scene would run. Raises the errors of `build`; user_code: see `build`."""
-    return describe_system(build(scene, user_code))
 
 
 def describe_system(system: System) -> str:

@@ -14,15 +14,14 @@ from support.stops import stopped_at
 
 from rigidmd import Scene, Simulation, resolve
 from rigidmd.assemble.build import build
-from rigidmd.assemble.describe import describe
 from rigidmd.assemble.harmonic import stable_angle, step_error
 from rigidmd.assemble.time_step import MARGIN, MIXED_ERROR, _one_digit, error_of_step, step_warnings
 from rigidmd.commands.cli import main
 from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
 from rigidmd.errors import SceneError
 from rigidmd.forces.ewald.errors import charges_in, pme_error, real_error
-from rigidmd.run import kind
 from rigidmd.run.force_errors import coulomb_errors
+from rigidmd.run.kind import describe
 from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
 
 WATER = {"model": "spce", "count": 64}
@@ -430,7 +429,7 @@ def test_the_scene_of_a_run_has_no_keys_without_an_effect(tmp_path):
 
 @pytest.mark.parametrize("name", ["heavy_top_3", "water", "water_dimer"])
 def test_check_names_no_classes(name):
-    text = kind.describe(Scene.read(ROOT / "systems" / f"{name}.toml"))
+    text = describe(Scene.read(ROOT / "systems" / f"{name}.toml"))
     assert re.findall(r"\b[A-Z][a-z]+[A-Z]\w*", text) == []
 
 

@@ -12,9 +12,9 @@ from support.schema_scenes import FIELDS, IONS
 
 import rigidmd
 from rigidmd.assemble.build import build
-from rigidmd.assemble.describe import describe
 from rigidmd.assemble.plausibility import molecule_warnings
 from rigidmd.errors import SceneError
+from rigidmd.run.kind import describe
 from rigidmd.scene import Scene
 from rigidmd.scene.models import available_models, load_model
 

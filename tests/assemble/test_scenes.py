@@ -5,9 +5,9 @@ from support.common import argon, same_bits, small_scene
 
 import rigidmd
 from rigidmd.assemble.build import build
-from rigidmd.assemble.describe import describe
 from rigidmd.errors import SceneError
 from rigidmd.run import Simulation
+from rigidmd.run.kind import describe
 from rigidmd.scene import MolecularScene, Scene
 
 

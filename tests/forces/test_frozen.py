@@ -6,12 +6,12 @@ from support.common import built, move, observe, shaken, site, small_scene
 from support.reference import Oracle
 
 from rigidmd.assemble.build import build
-from rigidmd.assemble.describe import describe
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.dynamics.model import mobile
 from rigidmd.errors import SceneError
 from rigidmd.mechanics.rotation import nearest_rotation
 from rigidmd.run import Simulation
+from rigidmd.run.kind import describe
 from rigidmd.scene import Scene
 
 CALORIE = 4.184

@@ -11,7 +11,6 @@ from support.common import shaken, small_scene
 from support.minima import TIGHT, WELL, minimum_of, stage_of
 
 from rigidmd.assemble.build import build
-from rigidmd.assemble.describe import describe
 from rigidmd.core.state import state_of
 from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.engines.samples import moving
@@ -23,6 +22,7 @@ from rigidmd.io.trajectory import read_frames
 from rigidmd.run import Every, Simulation
 from rigidmd.run import minimise as minimise_module
 from rigidmd.run import molecular as molecular_run
+from rigidmd.run.kind import describe
 from rigidmd.run.minimise import minimise, precision_of_minimisation
 from rigidmd.run.record import read_record
 from rigidmd.run.schedule import CheckpointSchedule

@@ -14,8 +14,8 @@ import pytest
 from support.common import ROOT, small_scene
 from support.processes import process, wait_until
 
-from rigidmd.assemble.describe import describe
 from rigidmd.run import Every, Simulation
+from rigidmd.run.kind import describe
 
 ASKED = {
     "log_interval_ps": 0.01,

@@ -9,12 +9,12 @@ import pytest
 from support.common import argon, small_scene
 
 from rigidmd.assemble.build import build
-from rigidmd.assemble.describe import describe
 from rigidmd.commands.cli import main
 from rigidmd.core.statistics import mean_and_error, slope
 from rigidmd.engines.samples import COLUMNS, Sample, Samples
 from rigidmd.io.run_files import columns
 from rigidmd.run import Simulation, run_together
+from rigidmd.run.kind import describe
 from rigidmd.run.molecular import MolecularRecord
 from rigidmd.run.report import summary_text
 from rigidmd.run.summary import summarise

@@ -12,7 +12,6 @@ from support.potentials import LJ, Pair, at_distance, points
 
 import rigidmd
 from rigidmd.assemble.build import build
-from rigidmd.assemble.describe import describe
 from rigidmd.errors import SceneError
 from rigidmd.features.potentials.sites.custom import CustomOneKind, tail_of_pair
 from rigidmd.features.potentials.sites.formulas import FormulaError, formula_of_function
@@ -21,6 +20,7 @@ from rigidmd.forces.potentials.lennard_jones import energy_and_force as of_built
 from rigidmd.forces.potentials.lennard_jones import lennard_jones as built_in
 from rigidmd.forces.potentials.lennard_jones import tail
 from rigidmd.forces.potentials.truncation import TRUNCATIONS, Unmodified, truncation_terms
+from rigidmd.run.kind import describe
 from rigidmd.units import KJ_PER_MOL
 
 # --- formulas -------------------------------------------------------------------------------------

@@ -78,7 +78,7 @@ import rigidmd
 from support.common import shaken
 from rigidmd import Scene
 from rigidmd.assemble.build import build
-from rigidmd.assemble.describe import describe
+from rigidmd.run.kind import describe
 from rigidmd import Simulation
 from rigidmd.errors import SceneError
 from rigidmd.scene import schema

@@ -13,12 +13,12 @@ from support.slopes import energy_of, force_on, torque_on, trace_of_virial, viri
 
 import rigidmd
 from rigidmd.assemble.build import build
-from rigidmd.assemble.describe import describe
 from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.core.statistics import slope
 from rigidmd.errors import SceneError
 from rigidmd.features.external.engines import external_engine
 from rigidmd.run import Simulation
+from rigidmd.run.kind import describe
 from rigidmd.units import KJ_PER_MOL
 
 BOXES = [

@@ -11,11 +11,11 @@ from support.reference import KE
 from support.slopes import energy_of, force_on, torque_on, trace_of_virial, virial_of
 
 from rigidmd.assemble.build import build
-from rigidmd.assemble.describe import describe
 from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.errors import SceneError
 from rigidmd.forces.neighbors.space import cell_of
+from rigidmd.run.kind import describe
 from rigidmd.scene import Scene
 from rigidmd.units import COULOMB, KJ_PER_MOL
 

@@ -9,12 +9,12 @@ from support.common import small_scene
 from support.slopes import energy_of, force_on, virial_of
 
 from rigidmd.assemble.build import build
-from rigidmd.assemble.describe import describe
 from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.errors import SceneError
 from rigidmd.features.external.verify import export
 from rigidmd.forces.fields import distances
 from rigidmd.run import Simulation
+from rigidmd.run.kind import describe
 
 TILTED = {"lengths_A": [18.0, 20.0, 22.0], "angles_deg": [80.0, 100.0, 75.0]}
 PAIR = {"between": [1, 4], "distance_A": 4.0, "stiffness_kJ_mol_A2": 7.0}

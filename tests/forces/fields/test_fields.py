@@ -23,13 +23,13 @@ from support.fields import (
 from support.slopes import energy_of, force_on, torque_on
 
 from rigidmd.assemble.build import build
-from rigidmd.assemble.describe import describe
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.state import REMOVED
 from rigidmd.dynamics.model import draw_momenta, remove_momentum
 from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.errors import SceneError
 from rigidmd.run import Simulation
+from rigidmd.run.kind import describe
 from rigidmd.run.trial_systems import molecular_trial_system
 from rigidmd.units import AVOGADRO, BOLTZMANN, ELEMENTARY_CHARGE
 
@@ -481,7 +481,7 @@ import numpy as np
 from support.common import shaken
 from rigidmd import Scene
 from rigidmd.assemble.build import build
-from rigidmd.assemble.describe import describe
+from rigidmd.run.kind import describe
 from rigidmd.errors import SceneError
 from rigidmd.scene import schema
 
