@@ -114,12 +114,6 @@ class Engine(Protocol):
         """Resume from a state with the arrays of `memory`, to the same bits. Raises ValueError if
         they do not fit."""
 
-    def check(
-        self, state: State, integrator: Scheme | Solver, dt: float, start: State | None
-    ) -> None:
-        """Raise ValueError unless a recalled state agrees with its extra variables. `start`: the
-        start of the run, if forces have not changed since."""
-
     @abstractmethod
     def forget(self) -> None:
         """Discard what depends on positions, because they were changed from outside since the last

@@ -88,11 +88,10 @@ class Term:
         """Arrays on which the next forces depend in addition to the state."""
         return {}
 
-    def restore(self, arrays: dict[str, np.ndarray], skin: float, now: float):
+    def restore(self, arrays: dict[str, np.ndarray], skin: float):
         """The workspace, which has machine code, with its `checkpoint_arrays`.
 
         skin : of neighbour lists, as requested, Å
-        now : the current time, ps
 
         Raises ValueError if the arrays do not fit.
         """

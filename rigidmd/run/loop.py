@@ -190,7 +190,6 @@ class RunLoop:
             with resume.as_checkpoint_errors(self._folder):
                 part.restore_record(checkpoint.of(RECORD))
                 part.restore(checkpoint)
-                part.check_position()
                 changed = resume.describe_changes(checkpoint.values["with"])
         part.record.scene, part.record.inputs = scene, input_sha256
         self._observers = _observers_by_name(part.default_observers(), simulation._observers)

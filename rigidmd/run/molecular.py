@@ -299,13 +299,6 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         check_same_scene(
             self.scene, record.scene | {"stages": decided or before}, record.inputs, step
         )
-        for stage, (chosen, then) in enumerate(zip(record.stages, before, strict=True)):
-            if stage not in record.choices and plain(chosen) != then:
-                raise ValueError(f"its stages.{stage} differs from its scene")
-        if any(
-            stage > k for stage in (*record.choices, *record.stable, *record.moves, *record.minima)
-        ):
-            raise ValueError(f"it has data of later stages than {k}")
         last = record.stages[-1].model_copy(
             update={"duration_ps": self.scene.stages[-1].duration_ps}
         )
@@ -315,11 +308,6 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         start = self.system.state
         like = start._replace(extra_variables=self.engine.variables(start, method))
         self.state = state_from(kept.of("state").arrays, like)
-        moves = any(
-            before.has_barostat or before.is_minimisation for before in record.stages[: k + 1]
-        )
-        if not moves and not np.array_equal(self.state.cell, start.cell):
-            raise ValueError("its box differs from the box of the scene")
         self.engine.recall(self.state, kept.of("engine").arrays)
         self._compile_stage(k)
 

@@ -2,14 +2,13 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Container
-from math import isclose
 from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.process import FairLock
-from rigidmd.core.state import NOW, ORIGIN, State
+from rigidmd.core.state import State
 from rigidmd.core.toml import Json
 from rigidmd.engines.protocol import Engine
 from rigidmd.errors import SimulationError
@@ -164,32 +163,6 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
         """Read the record of a checkpoint. Raises ValueError or KeyError."""
         values = restored(kept, self.record_type.types(), self.scene.rows)
         self.record = self.record_type(**values)
-
-    def check_position(self) -> None:
-        """Compare the position of a checkpoint with the scene and the state. Raises ValueError."""
-        position = self.record.position
-        state = self.state
-        count = len(self.durations())
-        if position.segment >= count or len(position.computing) != position.segment:
-            raise ValueError(f"it is of stage {position.segment} of {count}")
-        first, time = 0, 0.0
-        for before in map(self.reenter_segment, range(position.segment)):
-            first = first + before.steps
-            time = time + before.steps * before.dt
-        segment = self.reenter_segment(position.segment)
-        step = state.step.tolist()
-        done = int(state.step[NOW]) - first
-        if position.first != first or step[ORIGIN] != first or not 0 <= done <= segment.steps:
-            raise ValueError(
-                f"step {step[NOW]} is not in a stage of {segment.steps} steps after"
-                f" {position.first}"
-            )
-        now, origin = state.time.tolist()
-        unit = self.scene.time_unit
-        if not (isclose(origin, time, abs_tol=1e-6 * segment.dt) and position.time == time):
-            raise ValueError(f"its stage began at {origin:g} {unit}, not at {time:g} {unit}")
-        if now != origin + done * segment.dt:
-            raise ValueError(f"step {step[NOW]} is not at {now:g} {unit}")
 
     def is_replaced(self, moment: Moment) -> bool:
         """Whether the current moment is followed by another one of the same time."""

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from rigidmd.compile.machine import CODE_SETTINGS, PROCESSOR, PROCESSOR_FEATURES, SIMD_BITS
 from rigidmd.core.integrators import Scheme
-from rigidmd.core.state import NOW, ORIGIN, State
+from rigidmd.core.state import State
 from rigidmd.core.state_file import array_errors
 from rigidmd.core.toml import Json, shorten_text
 from rigidmd.errors import CheckpointError, SceneError, option
@@ -222,10 +222,6 @@ def state_from(arrays: Mapping[str, np.ndarray], like: State, *, exact: bool = T
             )
     if (np.isfinite(state.cell) != np.isfinite(like.cell)).any():
         raise ValueError("its state has another kind of box")
-    if not (
-        0 <= state.step[ORIGIN] <= state.step[NOW] and 0 <= state.time[ORIGIN] <= state.time[NOW]
-    ):
-        raise ValueError("its step or time is before the start")
     return state
 
 

@@ -19,7 +19,6 @@ from rigidmd.core.state import (
     LIST_FULL,
     NEEDS_PYTHON_FORCES,
     NOT_FINITE,
-    NOW,
     TALLY_SIZE,
     Load,
     State,
@@ -218,15 +217,13 @@ class CompiledEngine(Engine, Generic[ModelT, Bound]):
 
     def _memory_by_owner(self) -> dict[str, dict[str, np.ndarray]]:
         """Neighbour lists as last built, and forces at the current positions."""
-        arrays_of = self._checkpoint_arrays()
+        arrays_of: dict[str, dict[str, np.ndarray]] = {
+            name: trait(workspace, "checkpoint_arrays")()
+            for name, workspace in self.workspaces.items()
+        }
         if self.load is not None and self._last.is_current:
             arrays_of[LOAD] = self.load._asdict()
         return arrays_of
-
-    def _checkpoint_arrays(self) -> dict[str, dict[str, np.ndarray]]:
-        """Name of a term -> the arrays on which its next forces depend."""
-        workspaces = self.workspaces.items()
-        return {name: trait(workspace, "checkpoint_arrays")() for name, workspace in workspaces}
 
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
         self._prepare(state)
@@ -249,20 +246,18 @@ class CompiledEngine(Engine, Generic[ModelT, Bound]):
     def _recall_lists(self, state: State, arrays_of: dict[str, dict[str, np.ndarray]]) -> None:
         """Make new workspaces, with the neighbour lists that were kept: all of them or none."""
         spaces = _with_code(self.new_workspaces(state))
-        now = float(state.time[NOW])
         if arrays_of.keys() & set(self.names):
             pairs = zip(self.names, spaces, strict=False)
             spaces = tuple(
-                trait(workspace, "restore")(arrays_of.get(name, {}), self._setup.skin, now)
+                trait(workspace, "restore")(arrays_of.get(name, {}), self._setup.skin)
                 for name, workspace in pairs
             )
         self._workspaces = with_common_scratch(spaces)
 
     def _check_recalled(self, state: State, arrays_of: dict[str, dict[str, np.ndarray]]) -> None:
-        """Raise ValueError unless the kept forces are those that the kept lists give at the
-        state."""
+        """Raise ValueError unless the kept forces are those of this code at the state."""
         try:
-            load, tallies = self.evaluate(state)
+            load, _ = self.evaluate(state)
         except SimulationError as error:
             raise ValueError(f"forces cannot be evaluated at its state: {error}") from None
         rounding = ROUNDING[self._setup.dtype]
@@ -271,25 +266,7 @@ class CompiledEngine(Engine, Generic[ModelT, Bound]):
                 initial=0.0
             ):
                 raise ValueError(f"its state has another {name} than was kept with it")
-        self._check_lists(state, arrays_of, tallies)
-
-    def _check_lists(
-        self,
-        state: State,
-        arrays_of: dict[str, dict[str, np.ndarray]],
-        tallies: dict[str, Tally],
-    ) -> None:
-        """Raise ValueError unless the kept lists fit the state."""
-        if not self._has_lists(arrays_of):
-            raise ValueError("its neighbour lists are not those of its state")
-
-    def _has_lists(self, arrays_of: dict[str, dict[str, np.ndarray]]) -> bool:
-        """Whether the present lists are the kept ones."""
-        return all(
-            np.array_equal(array, arrays_of[name][key])
-            for name, of in self._checkpoint_arrays().items()
-            for key, array in of.items()
-        )
+        self._recall_lists(state, arrays_of)  # the evaluation may have built others
 
     def passes(self, state: State) -> dict[str, list[Pass]]:
         """Name of a term -> its passes at a state, in their order. Nothing is compiled."""

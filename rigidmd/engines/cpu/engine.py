@@ -169,18 +169,6 @@ class CpuEngine(CompiledEngine[Model, Advance]):
             copy_into(self._barostat, arrays)
         self._extension, self._extension_arrays = None, arrays_of.get(EXTENSION, {})
 
-    def _check_lists(
-        self,
-        state: State,
-        arrays_of: dict[str, dict[str, np.ndarray]],
-        tallies: dict[str, Tally],
-    ) -> None:
-        if BOX not in arrays_of and EXTENSION not in arrays_of:
-            super()._check_lists(state, arrays_of, tallies)
-        elif not self._has_lists(arrays_of):
-            # they were built for positions to which the state has not moved in the end
-            self._recall_lists(state, arrays_of)
-
     @property
     def moves(self) -> tuple[int, int]:
         if (box := self._barostat) is None:

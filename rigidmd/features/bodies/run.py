@@ -71,20 +71,6 @@ class Sampler(Observer):
             Snapshot(time, state) for time, state in zip(times.tolist(), states, strict=True)
         ]
 
-    def resume(self, run: "Simulation", kept: Checkpoint) -> None:
-        super().resume(run, kept)
-        times = np.array([snapshot.time for snapshot in self.snapshots])
-        if not (
-            (np.diff(times) >= 0).all()
-            and (times >= 0).all()
-            and (times <= run._part.state.time[NOW]).all()
-        ):
-            raise ValueError("the times of its samples cannot be of a run")
-        for snapshot in self.snapshots:
-            state_from(
-                dict(zip(State._fields, snapshot.state, strict=True)), run._part.state, exact=False
-            )
-
     def see(self, moment: Moment) -> None:
         self.snapshots.append(Snapshot(moment.time, moment.state))
 
@@ -117,14 +103,6 @@ class BodyWatch(Observer):
         self.exchanged = abs(self._start["kinetic"]) + (
             0.0 if system.translates else 2 * float(swing)
         )
-
-    def resume(self, run: "Simulation", kept: Checkpoint) -> None:
-        least = self.exchanged
-        super().resume(run, kept)
-        if self.exchanged < least:
-            raise ValueError(f"it has exchanged an energy of {self.exchanged:g} J")
-        if problem := self._failed_check(run._part.state, run.scene.run.timestep_s):
-            raise ValueError(f"its state cannot be of this run: {problem}")
 
     def see(self, moment: Moment) -> None:
         if problem := self._failed_check(self._run._part.state, self._run._part.segment.dt):
@@ -336,9 +314,6 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
         if k > 0:
             self.engine.change(*self.system.terms_at(float(self.state.time[ORIGIN])))
         self.engine.recall(self.state, kept.of("engine").arrays)
-        self.engine.check(
-            self.state, method, self._segments[k].dt, self.system.state if k == 0 else None
-        )
 
     def reenter_segment(self, k: int) -> Segment:
         return self._segments[k]

@@ -19,7 +19,7 @@ from rigidmd.compile import kernel
 from rigidmd.compile.simd import lane_count, zeros
 from rigidmd.core.state import CELL_CHANGED
 from rigidmd.errors import SimulationError
-from rigidmd.forces.neighbors.clusters import BUILT, Clusters, clusters_of, order_of
+from rigidmd.forces.neighbors.clusters import Clusters, clusters_of, order_of
 from rigidmd.forces.neighbors.tree import BoxTree, empty_tree
 
 IMAGE_BITS = 6
@@ -199,13 +199,10 @@ def checkpoint_arrays(pairs: PairList) -> dict[str, np.ndarray]:
     return arrays
 
 
-def restored(
-    pairs: PairList, arrays: dict[str, np.ndarray], requested_skin: float, now: float
-) -> PairList:
+def restored(pairs: PairList, arrays: dict[str, np.ndarray], requested_skin: float) -> PairList:
     """The new list with the clusters and the skin of a checkpoint. `update.refill` must follow if
     there are clusters.
-    requested_skin : in Å. now : the current time, ps. Raises ValueError if the arrays do not fit
-        such a list."""
+    requested_skin : in Å. Raises ValueError if the arrays do not fit such a list."""
     clusters, cell = pairs.clusters, pairs.cell
     like = {name: getattr(clusters, name) for name in (*CHECKPOINTED, "order")}
     like |= {"built": pairs.built, "times": pairs.times}
@@ -225,12 +222,6 @@ def restored(
     pairs = pairs._replace(skin=skin, shells_per_A=(SHELLS - 1) / skin)
     if "order" not in arrays:
         return pairs
-    with np.errstate(invalid="ignore"):  # of edges that are infinite
-        moved = np.abs(arrays["built"] - cell)
-    if not ((arrays["built"] == cell) | ((moved <= skin) & (moved < inf))).all():
-        raise ValueError("a neighbour list was built for another box")
-    if not 0 <= arrays["times"][BUILT] <= now:
-        raise ValueError(f"a neighbour list was built at {arrays['times'][BUILT]:g} ps")
     sites = len(clusters.slot)
     if not np.array_equal(np.sort(arrays["order"][:sites]), np.arange(sites)):
         raise ValueError("order of a neighbour list is none of its sites")

@@ -188,10 +188,10 @@ class PairWorkspace(NamedTuple):
     def checkpoint_arrays(self) -> dict[str, np.ndarray]:
         return lists.checkpoint_arrays(self.pairs)
 
-    def restore(self, arrays: dict[str, np.ndarray], skin: float, now: float) -> "PairWorkspace":
+    def restore(self, arrays: dict[str, np.ndarray], skin: float) -> "PairWorkspace":
         """With the list of a checkpoint. Needs machine code. Raises ValueError if the arrays do not
         fit this term."""
-        restored = self._replace(pairs=lists.restored(self.pairs, arrays, skin, now))
+        restored = self._replace(pairs=lists.restored(self.pairs, arrays, skin))
         while "order" in arrays and restored._refill() != OK:
             restored = restored.with_capacity(restored.pairs.cell)
         return restored

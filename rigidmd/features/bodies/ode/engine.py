@@ -135,36 +135,6 @@ class OdeEngine(BodyEngine):
         super().recall(state, memory)
         self._restart = False
 
-    def check(
-        self, state: State, integrator: Scheme | Solver, dt: float, start: State | None
-    ) -> None:
-        solver = _as_solver(integrator)
-        variables = len(state.extra_variables) // 3
-        if solver.name != RK4:
-            time, length = state.extra_variables[:2]
-            scales = state.extra_variables[2 + 2 * variables :]
-            if not (0 <= time <= state.time[NOW] and length >= 0 and (scales > 0).all()):
-                raise ValueError("the last step of its solver is invalid")
-            if start is not None and not np.array_equal(
-                scales, self.variables(start, integrator)[2 + 2 * variables :]
-            ):
-                raise ValueError("the scales of its variables differ from the start")
-        repeated = state.copy()
-        memory = self.memory() or {}
-        try:
-            self.advance(repeated, integrator, dt, int(state.step[NOW]))
-        except (SimulationError, ValueError) as error:
-            raise ValueError(f"its solver does not reach its state: {error}") from None
-        for name, recomputed, recorded in zip(State._fields, repeated, state, strict=True):
-            if not np.allclose(
-                recomputed,
-                recorded,
-                rtol=1e-9,
-                atol=1e-9 * np.abs(recorded[np.isfinite(recorded)]).max(initial=0.0),
-            ):
-                raise ValueError(f"its state has another {name} than its variables")
-        self.recall(state, memory)
-
     def forget(self) -> None:
         super().forget()
         self._solver = self._dense_output = None
