@@ -13,7 +13,6 @@ FEATURES = (
         needs=("studies", "view"),
         kind="body",
         kind_title="one body",
-        commands=("gallery",),
     ),
     Row(
         "external",

@@ -76,7 +76,7 @@ TESTED_BY = {
     " features/studies/sweep/replicas",
     "features/studies/sweep/test_table.py": "features/bodies/study features/studies/kind_study features/studies/sweep/figure",
     "features/studies/test_normal_modes.py": "features/studies/commands/modes features/studies/gamma_point",
-    "features/view/test_animation.py": "features/view/commands/film features/bodies/commands/gallery features/bodies/gallery features/view/commands/view"
+    "features/view/test_animation.py": "features/view/commands/film features/view/commands/view"
     " features/bodies/animation features/view/molecule_animation features/view/page features/view/solids",
     "features/view/test_mesh.py": "features/bodies/edges",
     "features/view/test_figures.py": "features/analysis/curve_figure features/bodies/figures features/view/figures/energy features/view/figures/panels"

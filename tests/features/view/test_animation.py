@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 from support.common import ROOT
-from support.pages import data_of, is_alone, numbers
+from support.pages import data_of, numbers
 
 from rigidmd.commands import cli
 from rigidmd.features.view import animation as film
@@ -179,18 +179,3 @@ def test_an_animation_in_which_a_body_rotates_too_far_between_frames_is_reported
 ):
     _, told = write_film(top, tmp_path / "top.gif", seconds, height=100)
     assert any("times between two frames" in sentence for sentence in told) == strobes
-
-
-def test_a_gallery_leads_to_animations(tmp_path, capsys):
-    folder = tmp_path / "gallery"
-    assert cli.main(["gallery", "heavy_top_3", "-o", str(folder)]) == 0
-    index = (folder / "index.html").read_text("utf-8")
-    assert index.count("<img") == 1
-    assert 'href="heavy_top_3.html"' in index
-    assert is_alone(index)
-    assert len(numbers(data_of(folder / "heavy_top_3.html")["time"], "<f8")) == 3401
-    assert cli.main(["gallery", "heavy_top_3", "-o", str(folder)]) == 2
-    assert "--force replaces it" in capsys.readouterr().err
-    assert cli.main(["gallery", "water", "-o", str(tmp_path / "other")]) == 2
-    assert "unknown body 'water'" in capsys.readouterr().err
-    assert not (tmp_path / "other").exists()
