@@ -24,8 +24,6 @@ def _examples(options: Options) -> int:
         for example in shipped:
             print(f"  {example.name:<{width}}  {example.about}")
         print()
-    print(
-        "`rigidmd new NAME` copies one into the working directory. `rigidmd run NAME.toml` runs a"
-    )
-    print("scene, and `rigidmd view runs/NAME` writes a page with its animation")
+    print("`rigidmd new NAME` copies one into the working directory, `rigidmd run NAME.toml` runs")
+    print("it, and `rigidmd view runs/NAME` writes a page with its animation")
     return 0

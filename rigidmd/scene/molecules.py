@@ -330,7 +330,19 @@ class MolecularScene(CouplingKeys, MatterKeys):
             )
         return topology
 
-    def _errors(self):
+    def _errors(self) -> Iterator[str]:
+        yield from self._errors_of_box()
+        yield from self._errors_of_start()
+        yield from self._errors_of_box_changes()
+        yield from self._errors_of_frozen()
+        cutoff, start = self.forces.cutoff_A, self.forces.switch_start_A
+        if start is not None and cutoff is not None and start >= cutoff:
+            yield f"forces.switch_start_A = {start:g} is not below cutoff_A = {cutoff:g}"
+        yield from field_errors(self)
+        yield from self._uneven_frames()
+
+    def _errors_of_box(self) -> Iterator[str]:
+        """Messages on a box that is given twice or not at all."""
         frameworks = [species for species in self.molecules if species.repeat is not None]
         if frameworks and (
             len(frameworks) > 1
@@ -369,6 +381,9 @@ class MolecularScene(CouplingKeys, MatterKeys):
             yield (
                 "box.vacuum_A and fields.walls across the same axis contradict each other: omit one"
             )
+
+    def _errors_of_start(self) -> Iterator[str]:
+        """Messages on the velocities of the start."""
         first = self.first_moving
         from_file = self.structure is not None and self.structure.velocities
         if (
@@ -400,6 +415,10 @@ class MolecularScene(CouplingKeys, MatterKeys):
                 "start.temperature_K is 0: a thermostat that rescales momenta cannot heat molecules"
                 " at rest"
             )
+
+    def _errors_of_box_changes(self) -> Iterator[str]:
+        """Messages on stages that change a box that must stay, or need the mean of one that did not
+        change."""
         reasons = {
             "box.periodic is false": not self.box.periodic,
             "frozen molecules do not move: release them, or keep the volume": any(
@@ -443,25 +462,23 @@ class MolecularScene(CouplingKeys, MatterKeys):
                     "needs an npt or nph stage just before it, at constant temperature and pressure"
                 )
                 yield f"stages.{k}.volume = 'mean' {why}; {preceding}. Add one, or leave volume out"
-        if self.forces.tail_correction and any(species.frozen for species in self.molecules):
+
+    def _errors_of_frozen(self) -> Iterator[str]:
+        """Messages on keys that contradict frozen molecules."""
+        if not any(species.frozen for species in self.molecules):
+            return
+        if self.forces.tail_correction:
             yield "forces.tail_correction assumes a uniform liquid: omit it with frozen molecules"
-        if self.forces.dispersion != "cutoff" and any(species.frozen for species in self.molecules):
+        if self.forces.dispersion != "cutoff":
             yield (
                 "forces.dispersion: sums over images also act between frozen molecules: use cutoff,"
                 " or freeze none"
             )
-        if self.run.remove_momentum_interval_ps and any(
-            species.frozen for species in self.molecules
-        ):
+        if self.run.remove_momentum_interval_ps:
             yield (
                 "run.remove_momentum_interval_ps: the total momentum is not conserved with frozen"
                 " molecules. Omit it"
             )
-        cutoff, start = self.forces.cutoff_A, self.forces.switch_start_A
-        if start is not None and cutoff is not None and start >= cutoff:
-            yield f"forces.switch_start_A = {start:g} is not below cutoff_A = {cutoff:g}"
-        yield from field_errors(self)
-        yield from self._uneven_frames()
 
     def errors_of_steps(self) -> list[str]:
         """Messages on default time steps that contradict other keys. Without them a scene has no

@@ -94,33 +94,53 @@ def settings(
     if alpha * cutoff > MAX_ALPHA_CUTOFF:
         return Settings(numbers, [f"{unreachable} with a cutoff of {cutoff:g} Å. Use a longer one"])
     numbers |= {"ewald_alpha_per_A": alpha, "ewald_accuracy": None}
-    longest = np.linalg.norm(cell, axis=1).max()
     if forces.electrostatics == "ewald":
-        radius = forces.ewald_k_radius_per_A
-        if not forces.sets_k_vectors:
-            radius = float(k_cutoff_for(charges, alpha, 2 * pi * np.linalg.inv(cell).T, part))
-        if (
-            radius is not None
-            and forces.ewald_k_max is None
-            and radius * longest > 2 * pi * MOST_K_VECTORS
-        ):
-            radius_and_origin = (
-                f"forces.ewald_k_radius_per_A = {radius:g}{_default(forces.ewald_k_radius_per_A)}"
-            )
-            return Settings(
-                numbers,
-                [
-                    f"{radius_and_origin} is more than {MOST_K_VECTORS} k-vectors along an edge of"
-                    " the box"
-                ],
-            )
-        if (
-            count := _number_of_k_vectors(forces, radius, composition.space.volume)
-        ) > MOST_K_VECTORS_IN_ALL:
-            fault = f"needs about {count:.2g} k-vectors, more than {MOST_K_VECTORS_IN_ALL:.2g}"
-            advice = "use pme, a lower accuracy, fewer k-vectors or a smaller box"
-            return Settings(numbers, [f"forces.electrostatics = 'ewald' {fault}: {advice}"])
-        return Settings(numbers | {"ewald_k_radius_per_A": radius}, [])
+        return _settings_of_vectors(forces, composition, alpha, part, numbers)
+    return _settings_of_grid(forces, composition, alpha, part, numbers, accuracy, unreachable)
+
+
+def _settings_of_vectors(
+    forces: Forces, composition: Composition, alpha: float, part: float, numbers: KeysAndValues
+) -> Settings:
+    """The radius of the k-vectors of a plain Ewald sum for an error `part`."""
+    cell = cell_of(composition.space)
+    radius = forces.ewald_k_radius_per_A
+    if not forces.sets_k_vectors:
+        inverse = 2 * pi * np.linalg.inv(cell).T
+        radius = float(k_cutoff_for(composition.charges, alpha, inverse, part))
+    longest = np.linalg.norm(cell, axis=1).max()
+    if (
+        radius is not None
+        and forces.ewald_k_max is None
+        and radius * longest > 2 * pi * MOST_K_VECTORS
+    ):
+        fault = (
+            f"forces.ewald_k_radius_per_A = {radius:g}{_default(forces.ewald_k_radius_per_A)} is"
+            f" more than {MOST_K_VECTORS} k-vectors along an edge of the box"
+        )
+        return Settings(numbers, [fault])
+    count = _number_of_k_vectors(forces, radius, composition.space.volume)
+    if count > MOST_K_VECTORS_IN_ALL:
+        fault = f"needs about {count:.2g} k-vectors, more than {MOST_K_VECTORS_IN_ALL:.2g}"
+        advice = "use pme, a lower accuracy, fewer k-vectors or a smaller box"
+        return Settings(numbers, [f"forces.electrostatics = 'ewald' {fault}: {advice}"])
+    return Settings(numbers | {"ewald_k_radius_per_A": radius}, [])
+
+
+def _settings_of_grid(
+    forces: Forces,
+    composition: Composition,
+    alpha: float,
+    part: float,
+    numbers: KeysAndValues,
+    accuracy: float,
+    unreachable: str,
+) -> Settings:
+    """The grid and the order of PME for an error `part`.
+
+    unreachable : the beginning of the sentence if there are none
+    """
+    cell = cell_of(composition.space)
     grid, order = forces.pme_grid, forces.pme_order
     has_given_cell = np.array_equal(composition.basis, direct_sum.SAME_BASIS)
     if grid is not None and len(set(grid)) > 1 and not has_given_cell:
@@ -131,7 +151,8 @@ def settings(
         )
         return Settings(numbers, [fault])
     if grid is None or order is None:
-        grid_and_order = pme_grid_for(charges, alpha, cell, part, order, grid)
+        longest = np.linalg.norm(cell, axis=1).max()
+        grid_and_order = pme_grid_for(composition.charges, alpha, cell, part, order, grid)
         if grid_and_order is None and longest > MAX_GRID_POINTS * COARSE_SPACING:
             fault = f"an edge of {longest:.4g} Å is too long for a grid of {MAX_GRID_POINTS} points"
             return Settings(numbers, [f"forces.electrostatics = 'pme': {fault}"])

@@ -23,6 +23,7 @@ from rigidmd.features.analysis.result import (
 from rigidmd.features.analysis.rigid_frames import EVEN, RigidFrames
 from rigidmd.features.analysis.runs import Runs
 from rigidmd.run.rigid_fit import Kind
+from rigidmd.scene.validation import not_none
 from rigidmd.units import BAR
 
 AT_ONCE = 4_000_000  # numbers that are transformed at a time
@@ -101,6 +102,31 @@ def msd(runs: Runs) -> AnalysisResult:
         )
         curve.add(f"MSD {kind.name} (A^2)", *displacement_and_error)
     return AnalysisResult("msd", "mean squared displacement", curves=[curve])
+
+
+def _in_infinite_box(runs: Runs, value: Value, eta: Value, edge: float, is_measured: bool) -> Value:
+    """The diffusion coefficient without the effect of the periodic images (Yeh and Hummer 2004),
+    from that in a cubic box.
+
+    edge : of the box, Å; is_measured : whether the viscosity is of these runs
+    """
+    name = f"{value.name} in an infinite box"
+    if eta.value is None:
+        note = f"no correction for the size of the box without a viscosity: {eta.note}"
+        return Value(name, "1e-9 m²/s", None, None, None, note)
+    correction = (
+        YEH_HUMMER * runs.thermal_energy / (6 * np.pi * eta.value * MPA_S * edge) / NM2_PER_S
+    )
+    source = "measured here" if is_measured else "as given, without its error"
+    note = (
+        f"corrected by {correction:.3g} for L = {edge:.4g} Å with a viscosity of"
+        f" {eta.value:.3g} mPa s, {source}"
+    )
+    doubt = correction * (eta.error or 0.0) / eta.value
+    both = None if value.error is None else float(np.hypot(value.error, doubt))
+    return value._replace(
+        name=name, value=not_none(value.value) + correction, error=both, note=note
+    )
 
 
 @built_in(
@@ -185,26 +211,8 @@ def diffusion(
             name, "1e-9 m²/s", D / NM2_PER_S, error / NM2_PER_S, runs.span, away, least=BLOCKS
         )
         result.values.append(value)
-        if value.value is None or edge is None:
-            continue
-        name = f"D of {kind.name} in an infinite box"
-        if eta.value is None:
-            note = f"no correction for the size of the box without a viscosity: {eta.note}"
-            result.values.append(Value(name, "1e-9 m²/s", None, None, None, note))
-            continue
-        correction = (
-            YEH_HUMMER * runs.thermal_energy / (6 * np.pi * eta.value * MPA_S * edge) / NM2_PER_S
-        )
-        source = "measured here" if viscosity_mPa_s is None else "as given, without its error"
-        note = (
-            f"corrected by {correction:.3g} for L = {edge:.4g} Å with a viscosity of"
-            f" {eta.value:.3g} mPa s, {source}"
-        )
-        doubt = correction * (eta.error or 0.0) / eta.value
-        both = None if value.error is None else float(np.hypot(value.error, doubt))
-        result.values.append(
-            value._replace(name=name, value=value.value + correction, error=both, note=note)
-        )
+        if value.value is not None and edge is not None:
+            result.values.append(_in_infinite_box(runs, value, eta, edge, viscosity_mPa_s is None))
     if edge is None and runs.has_box:
         result.notes.append(
             "no correction for the size of the box: the Yeh-Hummer correction is for cubic boxes"
