@@ -25,5 +25,5 @@ def _examples(options: Options) -> int:
             print(f"  {example.name:<{width}}  {example.about}")
         print()
     print("`rigidmd new NAME` copies one into the working directory, `rigidmd run NAME.toml` runs")
-    print("it, and `rigidmd view runs/NAME` writes a page with its animation")
+    print("it, and `rigidmd view runs/NAME` shows it in a browser")
     return 0
