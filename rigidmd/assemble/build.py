@@ -196,23 +196,23 @@ def interactions(parts: SystemParts) -> Interactions:
 
 def field_terms(scene: MolecularScene, parts: SystemParts) -> dict[str, NamedTuple]:
     """The terms of a scene's fields, by name. Raises SceneError with all errors."""
-    faults: list[str] = []
+    errors: list[str] = []
     terms: dict[str, NamedTuple] = {}
     for name, (kind, entry, where) in scene.fields.entries.items():
         term = import_module(f"rigidmd.forces.fields.{kind.module}").term(
-            parts, entry, where, faults
+            parts, entry, where, errors
         )
         if term is not None:
             terms[name] = term
     if (
-        not faults
+        not errors
         and scene.run.remove_momentum_interval_ps
         and not conserved_momentum(parts.model, terms).any()
     ):
         why = "fields or frozen molecules change all components of the total momentum. Leave it out"
-        faults.append(f"run.remove_momentum_interval_ps: {why}")
-    if faults:
-        raise SceneError(scene.source, faults)
+        errors.append(f"run.remove_momentum_interval_ps: {why}")
+    if errors:
+        raise SceneError(scene.source, errors)
     return terms
 
 

@@ -71,25 +71,25 @@ class SceneWithDefaults(NamedTuple):
 def with_defaults(scene: MolecularScene, composition: Composition) -> SceneWithDefaults:
     """A scene of molecules with all defaults except `with_momentum_removal` and
     `with_precision`."""
-    scene, faults = _with_electrostatics(scene, composition)
+    scene, errors = _with_electrostatics(scene, composition)
     numbers, cutoff_errors = _cutoff_and_switch(scene, composition)
-    faults += cutoff_errors
-    settings = Settings({}, faults)
+    errors += cutoff_errors
+    settings = Settings({}, errors)
     of_method = getattr(electrostatics_module(scene.forces), "settings", None)
-    if not faults and of_method is not None:
+    if not errors and of_method is not None:
         settings = of_method(
             scene.forces, composition, numbers["cutoff_A"], scene.engine.is_external
         )
-        faults = settings.errors
-    if not faults and scene.forces.dispersion != "cutoff":
+        errors = settings.errors
+    if not errors and scene.forces.dispersion != "cutoff":
         from rigidmd.forces.ewald import dispersion  # for these scenes only
 
         of_dispersion = dispersion.settings(scene.forces, composition, numbers["cutoff_A"])
         numbers = numbers | of_dispersion.numbers
-        faults = of_dispersion.errors
+        errors = of_dispersion.errors
     if scene.output.pressure_tensor_interval_ps and composition.space.volume == inf:
         why = "without which the pressure is not defined"
-        faults.append(f"output.pressure_tensor_interval_ps needs a periodic box, {why}")
+        errors.append(f"output.pressure_tensor_interval_ps needs a periodic box, {why}")
     output = scene.output
     if output.velocities is None:
         output = output.model_copy(update={"velocities": output.can_store_velocities})
@@ -121,7 +121,7 @@ def with_defaults(scene: MolecularScene, composition: Composition) -> SceneWithD
     if scene.start.temperature_K is None and not reads_velocities:
         temperature = scene.first_moving.temperatures[0] if scene.first_moving else 0.0
         tables["start"] = scene.start.model_copy(update={"temperature_K": temperature})
-    return SceneWithDefaults(scene.model_copy(update=tables), faults, settings.grid)
+    return SceneWithDefaults(scene.model_copy(update=tables), errors, settings.grid)
 
 
 def with_momentum_removal(scene: MolecularScene, keeps_momentum: np.ndarray) -> MolecularScene:
@@ -148,19 +148,19 @@ def _with_electrostatics(
     """A scene with its method of electrostatics, tail correction and cutoff scheme of charges, and
     error messages."""
     forces = scene.forces
-    faults = []
+    errors = []
     method = forces.electrostatics
     if method is None:
         has_charges = any(m.charges.any() for m in composition.species)
         method = (PERIODIC if composition.space.volume < inf else OPEN) if has_charges else "none"
-        faults += [f"forces.{message}" for message in forces.idle_key_errors(method)]
+        errors += [f"forces.{message}" for message in forces.idle_key_errors(method)]
     numbers: Json = {"electrostatics": method}
     if method == "reaction_field" and forces.reaction_field_truncation is None:
         like = forces.truncation in ("plain", "smooth_switch")
         numbers["reaction_field_truncation"] = forces.truncation if like else "shift"
     if forces.tail_correction is None:
         numbers["tail_correction"] = not without_tail_reason(scene, composition)
-    return scene.model_copy(update={"forces": forces.model_copy(update=numbers)}), faults
+    return scene.model_copy(update={"forces": forces.model_copy(update=numbers)}), errors
 
 
 def without_tail_reason(scene: MolecularScene, composition: Composition) -> str:
@@ -227,7 +227,7 @@ def _cutoff_and_switch(scene: MolecularScene, composition: Composition) -> tuple
     cutoff_A = forces.cutoff_A or (CUTOFF if space.volume < inf else None)
     cutoff = cutoff_A or inf
     start = forces.switch_start_A
-    faults = []
+    errors = []
     half = min(space.edges) / 2
     allowed = nearest_image_distance(cell_of(space)) / 2 if half < inf else inf
     least = "the smallest of a_x, b_y, c_z" if isinstance(space, Triclinic) else "the shortest edge"
@@ -244,28 +244,28 @@ def _cutoff_and_switch(scene: MolecularScene, composition: Composition) -> tuple
                     f" convention allows {allowed:.3f} Å, half the distance of its nearest images)"
                 )
             advice = f"Use {larger}, or {shorter}"
-            faults.append(
+            errors.append(
                 f"forces.{key} = {value:g}{default} is longer than {limit}, {why}. {advice}"
             )
     bodies = [m for m in composition.species if m.cell is None]  # a framework fills the box
     extents = {m.name: pdist(m.positions_body).max(initial=0.0) for m in bodies}
-    faults += [
+    errors += [
         f"a molecule of {m} is {x:.2f} Å long, more than {limit}"
         for m, x in extents.items()
         if x > half
     ]
     if start is not None and start >= cutoff:
-        faults.append(f"forces.switch_start_A = {start:g} is not below the cutoff of {cutoff:g} Å")
+        errors.append(f"forces.switch_start_A = {start:g} is not below the cutoff of {cutoff:g} Å")
     if forces.tail_correction and space.volume == inf:
-        faults.append(
+        errors.append(
             "forces.tail_correction needs a periodic box, filled by a uniform liquid beyond the"
             " cutoff"
         )
     if (of_method := getattr(electrostatics_module(forces), "setting_errors", None)) is not None:
-        faults += of_method(forces, space, cutoff)
+        errors += of_method(forces, space, cutoff)
     if start is None and cutoff < inf:
         schemes = (forces.truncation, forces.reaction_field_truncation or "")
         start = next(
             (default_switch_start(name, cutoff) for name in schemes if "switch" in name), None
         )
-    return {"cutoff_A": cutoff_A, "switch_start_A": start}, faults
+    return {"cutoff_A": cutoff_A, "switch_start_A": start}, errors

@@ -39,8 +39,8 @@ PRECISIONS = {
 def describe_system(system: System) -> str:
     """How the scene of a system would run. Raises SceneError if nothing would move, or if its
     output cannot be written."""
-    if faults := [*rest_errors(system), *output_errors(system)]:
-        raise SceneError(system.scene.source, faults)
+    if errors := [*rest_errors(system), *output_errors(system)]:
+        raise SceneError(system.scene.source, errors)
     scene, free = system.scene, system.last_freedom
     lines = [f"{scene.name}: {len(system.model.species)} molecules, {system.site_count} sites"]
     for k, m in enumerate(system.species):

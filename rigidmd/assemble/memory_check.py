@@ -30,8 +30,8 @@ ADVICE = "take fewer molecules, a smaller box or a shorter cutoff"
 
 def require_memory(source: str, needed: float, what: str, advice: str) -> None:
     """Raise SceneError if a number of bytes exceeds the free memory."""
-    if fault := memory_shortage(needed, what):
-        raise SceneError(source, [f"not enough memory: {fault}: {advice}"])
+    if error := memory_shortage(needed, what):
+        raise SceneError(source, [f"not enough memory: {error}: {advice}"])
 
 
 def check_memory_of_molecules(source: str, molecules: int, sites: int) -> None:

@@ -105,26 +105,26 @@ def scene_errors(
     heaviest = max(m.masses.max() for m in species)
     limits = {name: limit for name, limit in REFUSED.items() if heaviest <= limit.heaviest_site}
     refusals = (limit.outside(*values[name]) for name, limit in limits.items())
-    faults = [*filter(None, refusals)]
+    errors = [*filter(None, refusals)]
     contact = shortest_contact(species) if scene.forces.lennard_jones else inf
     if contact == inf:
-        return faults
-    faults += too_short(_lengths(scene.forces), contact, "the sites of two molecules")
+        return errors
+    errors += too_short(_lengths(scene.forces), contact, "the sites of two molecules")
     if not scene.forces.tail_correction:
-        return faults
+        return errors
     cutoff, start = scene.forces.cutoff_A, scene.forces.switch_start_A
     if SHORTEST * contact <= (cutoff or inf) < contact:
-        faults.append(
+        errors.append(
             "forces.tail_correction needs a cutoff beyond the contact of two molecules,"
             f" {contact:.3g} Å. cutoff_A is {cutoff:g}"
         )
     elif switches_cores(scene.forces, contact) and (start or 0.0) >= SHORTEST * contact:
-        faults.append(
+        errors.append(
             f"forces.tail_correction needs a switch that begins near the contact of two molecules,"
             f" {contact:.3g} Å, or beyond: it would count their overlaps. switch_start_A is"
             f" {start:g}"
         )
-    return faults
+    return errors
 
 
 def switches_cores(forces: "Forces", contact: float) -> bool:

@@ -64,17 +64,17 @@ def scene_from_atoms(
     ------
     SceneError
     """
-    if faults := atoms_errors(atoms):
-        raise SceneError(SOURCE, faults)
+    if errors := atoms_errors(atoms):
+        raise SceneError(SOURCE, errors)
     data = with_absolute_paths(settings)
     filled: dict[str, Json] = {
         key: data.setdefault(key, {}) for key in ("structure", "start", "box")
     }
-    faults = ["molecules is given by the atoms and models"] if "molecules" in data else []
+    errors = ["molecules is given by the atoms and models"] if "molecules" in data else []
     for key, table in filled.items():
         if not isinstance(table, Mapping):
             kind = type(table).__name__
-            faults.append(
+            errors.append(
                 f"{key} is a {kind}, must be a dictionary like the table [{key}] of a scene file"
             )
     structure, start, box = filled.values()
@@ -83,8 +83,8 @@ def scene_from_atoms(
         for key in ("file", "frame", "topology")
         if isinstance(structure, Mapping) and key in structure
     ]
-    if faults := faults + [f"structure.{key} is given by the atoms" for key in taken]:
-        raise SceneError(SOURCE, faults)
+    if errors := errors + [f"structure.{key} is given by the atoms" for key in taken]:
+        raise SceneError(SOURCE, errors)
     draws = start.get("temperature_K") is not None
     structure["file"] = STRUCTURE
     structure.setdefault("velocities", atoms.has("momenta") and not draws)
@@ -124,14 +124,14 @@ def atoms_errors(atoms: object) -> list[str]:
     values = [("position", atoms.positions)]
     values += [("momentum", atoms.get_momenta())] if atoms.has("momenta") else []
     values += [("mass", atoms.get_masses()[:, None])] if atoms.has("masses") else []
-    faults = []
+    errors = []
     for what, array in values:
         if not (fine := np.isfinite(array).all(axis=1)).all():
-            faults.append(f"atoms[{np.argmin(fine)}] has a {what} that is not a finite number")
+            errors.append(f"atoms[{np.argmin(fine)}] has a {what} that is not a finite number")
     if atoms.pbc.any() and not atoms.pbc.all():
         axes = ", ".join(x for x, periodic in zip("abc", atoms.pbc, strict=True) if periodic)
         advice = "set pbc along all three axes or none (a slab can have a long cell)"
-        faults.append(f"they are periodic along {axes} only: {advice}")
+        errors.append(f"they are periodic along {axes} only: {advice}")
     elif atoms.pbc.all():
         cell = atoms.cell.array
         if np.isfinite(cell).all():
@@ -139,11 +139,11 @@ def atoms_errors(atoms: object) -> list[str]:
         else:
             why = "it has an edge that is not a finite number"
         if why:
-            faults.append(
+            errors.append(
                 f"they are periodic, but their cell is invalid: {why}. Set atoms.cell, or atoms.pbc"
                 " = False"
             )
-    return faults
+    return errors
 
 
 def text_of(atoms: "ase.Atoms") -> str:

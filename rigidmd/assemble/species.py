@@ -40,19 +40,19 @@ MOST_LISTED = 8  # entries of parameters in a message
 
 def species_of(scene: MolecularScene) -> list[Molecule]:
     """The species of a scene, in its order. Raises SceneError with all errors."""
-    species, faults = [], []
+    species, errors = [], []
     for k, entry in enumerate(scene.molecules):
         try:
             species.append(_one_species(scene, entry))
         except InputError as error:
-            faults += [f"molecules.{k}: {error.where}: {fault}" for fault in error.errors]
+            errors += [f"molecules.{k}: {error.where}: {fault}" for fault in error.errors]
     names = [m.name for m in species]
     twice = sorted({name for name in names if names.count(name) > 1})
-    faults += [
+    errors += [
         f"molecules: {name} appears twice. Give these species different names" for name in twice
     ]
-    if faults:
-        raise SceneError(scene.source, faults)
+    if errors:
+        raise SceneError(scene.source, errors)
     return species
 
 
@@ -134,7 +134,7 @@ def sites_of_geometry(
     """Sites with positions from a file and parameters from entries of the scene or a table, by atom
     name, of a longer one its first five characters, or else by element, and notes on the file.
     `where` names the entries in messages. Raises StructureError with all errors."""
-    faults = []
+    errors = []
     sites = []
     used = set()
     available = list(dict.fromkeys(site.name for site in (*entries_of_scene, *table))) or ["none"]
@@ -148,7 +148,7 @@ def sites_of_geometry(
         name = name[:LONGEST_NAME]
         match, shared = find_site(entries_of_scene, name, element), find_site(table, name, element)
         if match is None and shared is None:
-            faults.append(
+            errors.append(
                 f"atom {name}: no entry of {where} has this name or the name {element}; {hint}"
             )
             continue
@@ -165,11 +165,11 @@ def sites_of_geometry(
             "charge_e": charge,
         }
         sites.append(match.model_copy(update=known) if match else Site(**known))
-    faults += [
+    errors += [
         f"sites: {s.name} is not an atom of it" for s in entries_of_scene if s.name not in used
     ]
-    if faults:
-        raise StructureError(str(path), list(dict.fromkeys(faults)))
+    if errors:
+        raise StructureError(str(path), list(dict.fromkeys(errors)))
     return with_parameters(tuple(sites), table), list(atoms.notes)
 
 
@@ -180,14 +180,14 @@ def split_frozen(
     species becomes two."""
     species = list(species)
     index = index.copy()
-    faults = []
+    errors = []
     frozen = [entry.frozen is True for entry in scene.molecules]
     for k, entry in enumerate(scene.molecules):
         of_species = index == k
         selected = np.zeros(len(index), bool)
         ranges = [] if isinstance(entry.frozen, bool) else spans(entry.frozen)
-        for _, mask, fault in select_by_number(ranges, species[k].name, of_species, number):
-            faults += [f"molecules.{k}.frozen: {fault}"] if fault else []
+        for _, mask, error in select_by_number(ranges, species[k].name, of_species, number):
+            errors += [f"molecules.{k}.frozen: {error}"] if error else []
             selected |= mask
         if selected.any() and (selected == of_species).all():
             frozen[k] = True
@@ -195,7 +195,7 @@ def split_frozen(
             index[selected] = len(species)
             species.append(species[k])
             frozen.append(True)
-    return species, index, np.array(frozen), faults
+    return species, index, np.array(frozen), errors
 
 
 #: Factor on the sum of covalent radii up to which two atoms are bonded.

@@ -77,19 +77,19 @@ def _without_vacuum(scene: MolecularScene, species: list[Molecule]) -> Configura
             )
         except StructureError as error:
             raise StructureError(scene.structure_source, error.errors) from None
-        faults = []
+        errors = []
         present = np.bincount(configuration.species, minlength=len(species))
         for k, (entry, present_count) in enumerate(zip(scene.molecules, present, strict=True)):
             if entry.count is not None and entry.count != present_count:
-                faults.append(
+                errors.append(
                     f"has {present_count} molecules of {species[k].name}, molecules.{k}.count is"
                     f" {entry.count}"
                 )
         if scene.structure.velocities and configuration.velocity is None:
             why = "".join(f"; {note}" for note in configuration.notes if "velocit" in note)
-            faults.append(f"lacks velocities for some atoms{why}. Omit structure.velocities = true")
-        if faults:
-            raise StructureError(scene.structure_source, faults)
+            errors.append(f"lacks velocities for some atoms{why}. Omit structure.velocities = true")
+        if errors:
+            raise StructureError(scene.structure_source, errors)
         return configuration
     n = sum(counts)
     sites = sum(count * len(m.masses) for count, m in zip(counts, species, strict=True))
@@ -117,8 +117,8 @@ def _about_framework(
     n = sum(counts)
     first = sum(counts[:framework])
     cell, rotation = standard_rotation(not_none(body.cell))
-    if fault := cell_error(cell):
-        raise SceneError(scene.source, [f"the cell of {body.name}: {fault}"])
+    if error := cell_error(cell):
+        raise SceneError(scene.source, [f"the cell of {body.name}: {error}"])
     rng = np.random.default_rng([scene.seed, LATTICE])
     lattice = _start_lattice(scene, species, n, np.diag(cell), rng) if n else np.zeros((0, 3))
     configuration = Configuration(
@@ -210,7 +210,7 @@ def _start_lattice(
     Raises SceneError."""
     low = np.zeros(3)
     high = edges.copy()
-    faults = []
+    errors = []
     for axis, name in enumerate(AXES):
         across = [walls for walls in scene.fields.walls if walls.direction == axis]
         if not across:
@@ -222,11 +222,11 @@ def _start_lattice(
         elif high[axis] == inf:
             high[axis] = low[axis] + edges[axis]
         if not low[axis] < high[axis]:
-            faults.append(
+            errors.append(
                 f"fields.walls: the walls across {name} leave no space for molecules between them"
             )
-    if faults:
-        raise SceneError(scene.source, faults)
+    if errors:
+        raise SceneError(scene.source, errors)
     edges = high - low
     shape = _lattice_shape(edges, n)
     points = np.stack(np.meshgrid(*(np.arange(k) for k in shape), indexing="ij"), axis=-1).reshape(
@@ -268,18 +268,18 @@ def overlaps(system: System) -> list[str]:
     widest = max((sigma.max() for sigma in cores), default=0.0)
     ranges = (inside, every_site), (OVERLAP * widest, lambda m: np.flatnonzero(m.epsilon > 0))
     sigma = gather_per_molecule(cores, system.model.species)
-    faults = []
+    errors = []
     for i, j, distance in close_pairs(system, system.state, *ranges):
         if distance <= max(
             inside, OVERLAP * (sigma[i] + sigma[j]) / 2 if sigma[i] > 0 and sigma[j] > 0 else 0.0
         ):
             a, b = system.sites.molecule[[i, j]]
             names = " and ".join(str(system.sites.name[k]) for k in (i, j))
-            faults.append(
+            errors.append(
                 f"molecules {a + 1} and {b + 1} overlap: {names} have a distance of"
                 f" {distance:.3f} Å"
             )
-    return faults[:5] + ([f"and {len(faults) - 5} more"] if len(faults) > 5 else [])
+    return errors[:5] + ([f"and {len(errors) - 5} more"] if len(errors) > 5 else [])
 
 
 def every_site(molecule: Molecule) -> np.ndarray:

@@ -111,8 +111,8 @@ def read_structure(
         configuration = configuration._replace(
             notes=(*configuration.notes, "the box of the scene is used, not the box of the file")
         )
-    if cell is not None and (fault := cell_error(cell)):
-        raise StructureError(str(path), [f"its box: {fault}"])
+    if cell is not None and (error := cell_error(cell)):
+        raise StructureError(str(path), [f"its box: {error}"])
     configuration = configuration._replace(cell=cell)
     if repeat != (1, 1, 1):
         count = prod(repeat) * np.bincount(configuration.species, minlength=len(species)).astype(
@@ -198,11 +198,11 @@ def _read_molecules(
     if unknown := [
         (number, name) for number, name in (atom_types or {}).items() if name not in (*known, "X")
     ]:
-        faults = [
+        errors = [
             f"structure.atom_types.{k} = {name!r} {hint}{did_you_mean(name, known)}"
             for k, name in unknown
         ]
-        raise StructureError(str(path), faults)
+        raise StructureError(str(path), errors)
     atoms = read_atoms(path, frame, atom_types, topology, content)
     atoms = with_elements(atoms, frozenset(label for m in species for label in labels_of(m)))
     notes = list(atoms.notes)
@@ -229,8 +229,8 @@ def _read_molecules(
         atoms = atoms._replace(cell=cell)
     if periodic and scene_cell is None:
         _check_box(path, atoms.cell, notes)
-    if atoms.cell is not None and periodic and (fault := cell_error(atoms.cell)):
-        raise StructureError(str(path), [f"its box: {fault}"])
+    if atoms.cell is not None and periodic and (error := cell_error(atoms.cell)):
+        raise StructureError(str(path), [f"its box: {error}"])
     matched = match(
         atoms,
         species,
@@ -241,14 +241,14 @@ def _read_molecules(
         others = [f"and {len(matched) - MOST_NAMED} more"] if len(matched) > MOST_NAMED else []
         if atom_types is None and has_types(path) and matched[0].startswith("has atoms named"):
             matched[0] += ". If these are types, structure.atom_types gives them names"
-        faults = (
+        errors = (
             _unknown_masses(atoms, species)
             + matched[:MOST_NAMED]
             + others
             + _other_units(atoms, species)
         )
-        faults += [f"as read: {note}" for note in atoms.notes]
-        raise StructureError(str(path), faults)
+        errors += [f"as read: {note}" for note in atoms.notes]
+        raise StructureError(str(path), errors)
     if len(matched.species) == 0:
         raise StructureError(str(path), ["has no atoms with mass"])
     notes += [*matched.notes, *_notes(atoms, matched, species)]
@@ -408,15 +408,15 @@ def _read_state(path: Path, species: list[Molecule]) -> Configuration:
         )
     of_name = {molecule.name: molecule for molecule in species}
     models = () if saved.models is None else zip(saved.names, saved.models, strict=True)
-    faults = [fault for name, model in models if (fault := _other_model(of_name[name], model))]
+    errors = [error for name, model in models if (error := _other_model(of_name[name], model))]
     state = saved.state
     n = len(saved.species)
     has_rotations = len(saved.state.rotation) > 0
     rotating = [name for name in saved.names if of_name[name].inertia.any()]
     if rotating and not has_rotations:
-        faults.append(f"has no rotations, but {', '.join(rotating)} can rotate")
-    if faults:
-        raise StructureError(str(path), faults)
+        errors.append(f"has no rotations, but {', '.join(rotating)} can rotate")
+    if errors:
+        raise StructureError(str(path), errors)
     return Configuration(
         species=np.array([known.index(name) for name in saved.names])[saved.species],
         position=state.position,

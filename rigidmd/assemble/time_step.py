@@ -152,8 +152,8 @@ def with_time_steps(
             step = _default_step(scene, stage, fastest)
             stages[k] = stage.model_copy(update={"timestep_fs": step})
     complete = scene.model_copy(update={"stages": tuple(stages)})
-    if faults := complete.errors_of_steps():
-        raise SceneError(scene.source, faults)
+    if errors := complete.errors_of_steps():
+        raise SceneError(scene.source, errors)
     return complete
 
 

@@ -200,7 +200,7 @@ def select_by_number(
     for first, last in ranges:
         text = f"{first}" if first == last else f"{first}-{last}"
         mask = of_species & (first <= number) & (number <= last)
-        fault = ""
+        error = ""
         present = number[of_species]
         if not mask.any() or last > present.max():
             existing = (
@@ -208,8 +208,8 @@ def select_by_number(
                 if len(present)
                 else "there are none"
             )
-            fault = f"no {name} has the number {text}; {existing}"
-        yield text, mask, fault
+            error = f"no {name} has the number {text}; {existing}"
+        yield text, mask, error
 
 
 def gather_per_molecule(values: list[np.ndarray], species: np.ndarray) -> np.ndarray:

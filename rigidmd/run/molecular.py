@@ -100,8 +100,8 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             forces if isinstance(forces, Sequence) and not hasattr(forces, "_fields") else (forces,)
         )
         self._start = build(scene.with_user_code(() if forces is None else user_forces, thermostat))
-        if faults := rest_errors(self._start):
-            raise SceneError(scene.source, faults)
+        if errors := rest_errors(self._start):
+            raise SceneError(scene.source, errors)
         self.reset()
 
     @property
@@ -113,8 +113,8 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         return usable_threads(self.scene.threads)
 
     def start_from(self, state: State) -> None:
-        if faults := self._start.state_errors(state):
-            raise StructureError("start_from", faults)
+        if errors := self._start.state_errors(state):
+            raise StructureError("start_from", errors)
         self._start = replace(self._start, state=state_of(*state[:5]), from_lattice=False)
         self.reset()
 

@@ -253,11 +253,11 @@ class Scene(Section, Displayed):
         kind = class_for(data) if cls is Scene else cls
         if kind is None:
             raise SceneError(source, [without_kind()])
-        faults, overridden = [], []
+        errors, overridden = [], []
         for named, value in overrides.items():
             is_file = isinstance(value, str) and FILE_KEYS.fullmatch(named)
             key, wrong = override(data, named, os.path.abspath(value) if is_file else value)
-            faults += wrong
+            errors += wrong
             if value is None and parse_whole_number(key.rpartition(".")[2]) is not None:
                 text = ""  # the entries after a removed one are numbered differently in the text
             else:
@@ -268,10 +268,10 @@ class Scene(Section, Displayed):
                 source, [f"{location_of(keys, text, overridden)}: {fault}" for keys, fault in wrong]
             )
         wrong = numbers_out_of_range(data, *kind.SIZES)
-        faults += [f"{location_of(keys, text, overridden)}: {fault}" for keys, fault in wrong]
+        errors += [f"{location_of(keys, text, overridden)}: {fault}" for keys, fault in wrong]
         for keys, _ in wrong:  # checks of whole tables calculate with all numbers
             limit_number(data, keys, *kind.SIZES)
-        faults += kind.contradictions(data, text)
+        errors += kind.contradictions(data, text)
         for keys, name in values_in(data):
             key = ".".join(map(str, keys))
             if not (isinstance(name, str) and FILE_KEYS.fullmatch(key)) or key in (
@@ -282,21 +282,21 @@ class Scene(Section, Displayed):
             path = folder / name
             if not (embedded_files or is_within(key, overridden) or is_inside(path, folder)):
                 advice = f"move it there, or set it by {setting(key, 'PATH')}"
-                faults.append(
+                errors.append(
                     f"{where}: {shorten_repr(name)} is outside the scene's folder; {advice}"
                 )
             elif fault := unreadable_reason(path):
-                faults.append(f"{where}: {fault}: {shorten_repr(str(path))}{_similar_files(path)}")
+                errors.append(f"{where}: {fault}: {shorten_repr(str(path))}{_similar_files(path)}")
         complete, rows = with_registered_rows(exact_names(data, kind))
         scene = None
         try:
             scene = kind.model_validate(complete, context=rows)
         except ValidationError as error:
             reported = [keys for keys, _ in wrong]
-            faults += validation_messages(error, kind, text, overridden, reported)
-        if scene is None or faults:
+            errors += validation_messages(error, kind, text, overridden, reported)
+        if scene is None or errors:
             raise SceneError(
-                source, [fault + _removal_hint(fault, data, overridden) for fault in faults]
+                source, [fault + _removal_hint(fault, data, overridden) for fault in errors]
             )
         scene._source, scene._folder, scene._embedded_files = source, folder, embedded_files or {}
         return scene
@@ -444,12 +444,12 @@ def file_name(wanted: Callable[[Format], object]) -> AfterValidator:
     return AfterValidator(check)
 
 
-def _removal_hint(fault: str, data: dict, overridden: Iterable[str]) -> str:
+def _removal_hint(error: str, data: dict, overridden: Iterable[str]) -> str:
     """How to remove the keys that contradict overridden ones on the command line. Empty for any
     other error."""
-    if not re.search("not both|omit one|contradict", fault):
+    if not re.search("not both|omit one|contradict", error):
         return ""
-    names = re.findall(r"[a-z]\w*(?:\.\w+)*", fault)
+    names = re.findall(r"[a-z]\w*(?:\.\w+)*", error)
     if overridden:
         tables = dict.fromkeys(["", *(f"{key.rpartition('.')[0]}." for key in overridden)])
     else:

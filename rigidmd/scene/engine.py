@@ -32,8 +32,8 @@ class _Engine(Section):
                         f"{key} would have no effect with engine.name = {self.name!r}. It is for"
                         f" {name}"
                     )
-        if self.program and (fault := self.program.option_errors(**self.options)):
-            yield fault
+        if self.program and (error := self.program.option_errors(**self.options)):
+            yield error
 
     @property
     def program(self) -> Program | None:

@@ -156,10 +156,10 @@ def integrator(
     try:
         _REGISTERED[name] = IntegratorRow.model_validate(table)
     except ValidationError as error:
-        faults = [
+        errors = [
             fault.removeprefix("scene: ") for fault in validation_messages(error, IntegratorRow)
         ]
-        raise SceneError(f"integrator {name!r:.60}", faults) from None
+        raise SceneError(f"integrator {name!r:.60}", errors) from None
     return name
 
 

@@ -291,11 +291,11 @@ def molecule(
     missing = [
         (s, key) for s in sites for key in ("mass_u", "position_A") if getattr(s, key) is None
     ]
-    faults = [f"site {s.name}: {key} is missing" for s, key in missing]
+    errors = [f"site {s.name}: {key} is missing" for s, key in missing]
     if len(sites) > MOST_SITES:
-        faults.append(f"has {len(sites)} sites, must not have more than {MOST_SITES}")
-    if faults:
-        raise MoleculeError(f"molecule {name}", faults)
+        errors.append(f"has {len(sites)} sites, must not have more than {MOST_SITES}")
+    if errors:
+        raise MoleculeError(f"molecule {name}", errors)
     masses, positions = np.array([s.mass_u for s in sites]), np.array([s.position_A for s in sites])
     if masses.sum() == 0:
         raise MoleculeError(
@@ -307,11 +307,11 @@ def molecule(
     from scipy.spatial import KDTree  # slow to import
 
     near = KDTree(body).query_pairs(COINCIDENT * size, output_type="ndarray")
-    faults += [
+    errors += [
         f"sites {sites[j].name} and {sites[i].name} coincide"
         for i, j in sorted(near[:, ::-1].tolist())
     ]
-    if frame.kind == "linear" or (frame.kind == "point" and not faults):
+    if frame.kind == "linear" or (frame.kind == "point" and not errors):
         off = np.linalg.norm(body[:, 1:] if frame.kind == "linear" else body, axis=1)
         limit = OFF_AXIS * size
         where = "from the centre of mass, but all the mass is there: nothing resists its torque"
@@ -320,13 +320,13 @@ def molecule(
                 "off the axis of a linear body: nothing resists its torque about that axis. Put it"
                 " on the line of the other sites"
             )
-        faults += [
+        errors += [
             f"site {s.name} is {d:.3g} Å {where}"
             for s, d in zip(sites, off, strict=True)
             if d > limit
         ]
-    if faults:
-        raise MoleculeError(f"molecule {name}", faults)
+    if errors:
+        raise MoleculeError(f"molecule {name}", errors)
     if frame.kind == "point":
         body = np.zeros_like(body)  # exactly at the centre of mass, without rounding errors
     return Molecule(
@@ -352,7 +352,7 @@ def molecule(
 def with_masses(original: Molecule, masses: dict[str, float]) -> Molecule:
     """The same molecule with other masses (u) of isotopes, by site name or else element. Raises
     MoleculeError."""
-    faults = []
+    errors = []
     changed = {}
     for key, mass in masses.items():
         sites = [i for i, name in enumerate(original.site_names) if name == key]
@@ -364,10 +364,10 @@ def with_masses(original: Molecule, masses: dict[str, float]) -> Molecule:
                 why = "is massless, and stays so"
             else:
                 why = f"is not a site or element of it; there are {known}"
-            faults.append(f"masses_u.{key} {why}")
+            errors.append(f"masses_u.{key} {why}")
         changed |= {i: mass for i in heavy if i not in changed or original.site_names[i] == key}
-    if faults:
-        raise MoleculeError(f"molecule {original.name}", faults)
+    if errors:
+        raise MoleculeError(f"molecule {original.name}", errors)
     sites = [
         Site(**entry | {"mass_u": changed.get(i, entry["mass_u"])})
         for i, entry in enumerate(original.sites())
@@ -431,8 +431,8 @@ def _models_called(name: str, known: list[str]) -> list[str]:
 
 def load_model(name: str) -> Molecule:
     """A shipped model by name. Raises MoleculeError."""
-    if fault := model_error(name):
-        raise MoleculeError("models", [fault])
+    if error := model_error(name):
+        raise MoleculeError("models", [error])
     return read_molecule(MODELS / f"{name}.toml")
 
 
@@ -450,16 +450,16 @@ def read_parameters(path: Path) -> ParameterFile:
     """A table of parameters. Raises MoleculeError."""
     table = _read(path, ParameterFile)
     names = [s.name for s in table.sites]
-    faults = [
+    errors = [
         f"sites: {name} appears twice" for name in sorted(set(names)) if names.count(name) > 1
     ]
-    faults += [
+    errors += [
         f"sites: {s.name}: position_A belongs to a molecule"
         for s in table.sites
         if s.position_A is not None
     ]
-    if faults:
-        raise MoleculeError(str(path), faults)
+    if errors:
+        raise MoleculeError(str(path), errors)
     return table
 
 

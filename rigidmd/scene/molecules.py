@@ -484,9 +484,9 @@ class MolecularScene(CouplingKeys, MatterKeys):
         """Messages on default time steps that contradict other keys. Without them a scene has no
         errors."""
         of_stages = [
-            f"stages.{k}: {fault}"
+            f"stages.{k}: {error}"
             for k, stage in enumerate(self.stages)
-            for fault in stage._errors()
+            for error in stage._errors()
         ]
         return [*of_stages, *self._errors()]
 
@@ -547,11 +547,11 @@ class MolecularScene(CouplingKeys, MatterKeys):
                     f" {other}"
                 )
             elif abs(every * stage.step - interval) > 1e-9 * interval or uneven:
-                fault = (
+                error = (
                     f"a {kind} file stores one time between frames, and stages.{k} cannot keep"
                     f" {interval:g} ps"
                 )
                 advice = (
                     f"make it a multiple of timestep_fs and a divisor of duration_ps, or {other}"
                 )
-                yield f"output.trajectory: {fault}: {advice}"
+                yield f"output.trajectory: {error}: {advice}"

@@ -88,8 +88,8 @@ class Molecules(Section):
     @classmethod
     def _is_known(cls, model: str | None):
         model = exact_names(model, Literal[tuple(available_models())])
-        if model is not None and (fault := model_error(model)):
-            raise ValueError(fault)
+        if model is not None and (error := model_error(model)):
+            raise ValueError(error)
         return model
 
     def _errors(self):
@@ -98,7 +98,7 @@ class Molecules(Section):
             key is not None for key in (self.model, self.file, self.sites, self.parameters)
         )
         is_complete = file and str(self.file).endswith(".toml")
-        faults = {
+        errors = {
             "give a model, or a custom file and sites, not both": model and (file or sites),
             "parameters would have no effect: a model or a .toml file contains parameters": (
                 table and (model or is_complete)
@@ -117,7 +117,7 @@ class Molecules(Section):
                 self.repeat and not (self.frozen is True and self.count in (None, 1))
             ),
         }
-        return [fault for fault, is_there in faults.items() if is_there][:1]
+        return [error for error, is_there in errors.items() if is_there][:1]
 
     @property
     def label(self) -> str:

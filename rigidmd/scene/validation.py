@@ -70,8 +70,8 @@ class Section(BaseModel):
 
     @model_validator(mode="after")
     def _is_sound(self):
-        if faults := "; ".join(self._errors()):
-            raise ValueError(faults)
+        if errors := "; ".join(self._errors()):
+            raise ValueError(errors)
         return self
 
     def _errors(self) -> Iterable[str]:
@@ -138,7 +138,7 @@ def validation_messages(
     overridden : keys that are set by the command line and have no line
     reported : paths of keys that have messages already
     """
-    faults: dict[tuple, list[str]] = {}
+    errors: dict[tuple, list[str]] = {}
     for detail in error.errors(include_url=False):
         unknown = detail["type"] == "extra_forbidden"  # the last key is text of the user
         names = detail["loc"][:-1] if unknown else detail["loc"]
@@ -147,15 +147,15 @@ def validation_messages(
         if detail["type"] == "missing" and keys and isinstance(keys[-1], int):
             keys = keys[:-1]  # the list lacks an entry
         # Messages beyond the number shown are only counted.
-        sentence = _sentence(detail, keys, model) if len(faults) <= MOST_SHOWN else detail["msg"]
-        faults.setdefault(tuple(keys), []).append(sentence)
+        sentence = _sentence(detail, keys, model) if len(errors) <= MOST_SHOWN else detail["msg"]
+        errors.setdefault(tuple(keys), []).append(sentence)
     # pydantic reports one error for each type that a value may have: join them. An error inside a
     # value is more specific than an error of the whole value.
     known = set(map(tuple, reported))
-    around = {keys[:depth] for keys in {*faults, *known} for depth in range(1, len(keys))}
+    around = {keys[:depth] for keys in {*errors, *known} for depth in range(1, len(keys))}
     return [
         f"{location_of(list(keys), text, overridden)}: {_either(list(dict.fromkeys(sentences)))}"
-        for keys, sentences in faults.items()
+        for keys, sentences in errors.items()
         if keys not in around | known
     ]
 

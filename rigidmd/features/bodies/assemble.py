@@ -74,12 +74,12 @@ def build_body(
     moments = moments + added_inertia
     rotates = bool(moments.any())
     applied = applied or {}
-    faults = [*_body_errors(scene, centre, moments, axes, added_mass)]
+    errors = [*_body_errors(scene, centre, moments, axes, added_mass)]
     attitude = scene.start.attitude
     spin = axes.T @ scene.start.angular_velocity  # along the principal axes
     if rotates and ((moments == 0) & (np.abs(spin) > 1e-12 * np.abs(spin).max(initial=0.0))).any():
-        faults.append("start: the body rotates about an axis without inertia")
-    faults += _integrator_errors(
+        errors.append("start: the body rotates about an axis without inertia")
+    errors += _integrator_errors(
         scene, immersed=bool(added_mass.any()), has_functions=bool(applied)
     )
     taken = {
@@ -89,10 +89,10 @@ def build_body(
         *(f"applied_{k}" for k in range(len(scene.applied))),
     }
     why = "is the name of a force of the scene. Choose another"
-    faults += [f"applied: {name!r} {why}" for name in applied if name in taken]
-    faults += _torque_errors(scene, axes, moments)
-    if faults:
-        raise SceneError(scene.source, faults)
+    errors += [f"applied: {name!r} {why}" for name in applied if name in taken]
+    errors += _torque_errors(scene, axes, moments)
+    if errors:
+        raise SceneError(scene.source, errors)
 
     scene = body_with_defaults(
         scene, rotates=rotates, radius=float(np.linalg.norm(points, axis=1).max())
@@ -128,12 +128,12 @@ def build_body(
         form = not_none(format_of(not_none(scene.output.topology)))
         if form.exceeded(system.site_positions(system.state)) is not None:
             reach = system.scale * np.abs(system.state.position).max()
-            fault = (
+            error = (
                 f"start.position_m is {reach:.3g} Å in the trajectory, which"
                 f" {scene.output.topology} cannot hold"
             )
             advice = "set output.trajectory_A_per_m to less, or output.trajectory = false"
-            raise SceneError(scene.source, [f"{fault}: {advice}"])
+            raise SceneError(scene.source, [f"{error}: {advice}"])
     return system
 
 

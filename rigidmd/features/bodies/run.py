@@ -250,8 +250,8 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
         """A body has one thread."""
 
     def start_from(self, state: State) -> None:
-        if faults := self._scene_system.state_errors(state):
-            raise StructureError("start_from", faults)
+        if errors := self._scene_system.state_errors(state):
+            raise StructureError("start_from", errors)
         if self._choice is not None:
             why = "integrator = 'auto' has chosen for the start of the scene"
             raise StructureError("start_from", [f"{why}: set integrator and timestep_s"])

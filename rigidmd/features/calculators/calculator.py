@@ -112,17 +112,17 @@ class RigidMD(Calculator):
         **forces: object,
     ):
         super().__init__()
-        faults = []
+        errors = []
         if atom_forces not in ("gradient", "sites"):
-            faults.append(f"atom_forces is {atom_forces!r}, must be 'gradient' or 'sites'")
+            errors.append(f"atom_forces is {atom_forces!r}, must be 'gradient' or 'sites'")
         if not 0 < bend <= tolerance < 1:
-            faults.append(
+            errors.append(
                 f"bend = {bend} and tolerance = {tolerance}: must be 0 < bend <= tolerance < 1"
             )
         tables = (("precision", precision), ("fields", fields), ("forces", forces or None))
         given = {key: value for key, value in tables if value is not None}
         known = list(Forces.model_fields)
-        faults += [
+        errors += [
             f"unknown keyword {key}{did_you_mean(key, known)}" for key in forces if key not in known
         ]
         self._user_forces: tuple[object, ...] = ()
@@ -130,14 +130,14 @@ class RigidMD(Calculator):
         if not isinstance(models, Scene):
             species = models
         elif not is_molecular(models):
-            faults.append(f"the scene {models.name} is of {models.subject}, which has no atoms")
+            errors.append(f"the scene {models.name} is of {models.subject}, which has no atoms")
         elif given:
-            faults.append(f"{', '.join(given)}: set by the scene. Change the scene")
+            errors.append(f"{', '.join(given)}: set by the scene. Change the scene")
         else:
             self._user_forces = models.user_code.forces
             species, given = _parts_of(models)
-        if faults:
-            raise SceneError("RigidMD", faults)
+        if errors:
+            raise SceneError("RigidMD", errors)
         self._models = models_with_absolute_paths(species)
         self._settings = with_absolute_paths(given)
         self._form: Form = atom_forces
@@ -215,8 +215,8 @@ class RigidMD(Calculator):
         deviate much more than before, other atoms may be at the positions of these: then they are
         matched again, and the better match counts, so that an energy does not depend on the atoms
         that were seen before."""
-        if faults := atoms_errors(atoms):
-            raise SceneError(SOURCE, faults)
+        if errors := atoms_errors(atoms):
+            raise SceneError(SOURCE, errors)
         known = (
             self._assembly
             if self._assembly is not None and self._assembly.applies_to(atoms)
@@ -528,8 +528,8 @@ def _parts_of(scene: MolecularScene) -> tuple[list[Json], Json]:
     tables = with_absolute_paths(scene.model_dump(exclude_defaults=True), scene.path(""))
     unknown = [key for key in tables if key not in (*TABLES, *WITHOUT_ENERGIES)]
     if unknown:
-        faults = [f"{key}: a calculator cannot use this table. Leave it out" for key in unknown]
-        raise SceneError(scene.source, faults)
+        errors = [f"{key}: a calculator cannot use this table. Leave it out" for key in unknown]
+        raise SceneError(scene.source, errors)
     for table in tables["molecules"]:
         table.pop("count", None)
     return list(tables["molecules"]), {key: tables[key] for key in TABLES if key in tables}

@@ -39,11 +39,11 @@ def with_coupling(
             scene.forces.dispersion != "cutoff"
         ),
     }
-    faults = [f"coupling: {reason}" for reason, applies in reasons.items() if applies]
+    errors = [f"coupling: {reason}" for reason, applies in reasons.items() if applies]
     if coupling.charges_from is None:
         begin = CHARGES_FROM if any(m.charges.any() for m in named) else 1.0
         coupling = coupling.model_copy(update={"charges_from": begin})
-    return scene.model_copy(update={"coupling": coupling}), faults
+    return scene.model_copy(update={"coupling": coupling}), errors
 
 
 def coupled(parts: SystemParts) -> SystemParts:

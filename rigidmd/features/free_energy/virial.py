@@ -151,21 +151,21 @@ def second_virial(
         models.reverse()  # the tetrahedron averages the second one
     net = [abs(m.charges.sum()) > NEUTRAL for m in models]
     settings = settings or {}
-    faults = [
+    errors = [
         f"{key}: two molecules in open space take keys of [forces] only, such as forces.mixing"
         for key in settings
         if key.partition(".")[0] != "forces"
     ]
     if all(net):
-        faults.append("both molecules have a net charge: their second virial coefficient diverges")
+        errors.append("both molecules have a net charge: their second virial coefficient diverges")
     if models[0].name == models[1].name and first != (second or first):
-        faults.append(f"both models are named {models[0].name}; rename one")
+        errors.append(f"both models are named {models[0].name}; rename one")
     if not (len(temperatures) and all(0 < t <= HOTTEST for t in temperatures)):
-        faults.append(f"temperatures must be above 0 K and at most {HOTTEST:g} K")
+        errors.append(f"temperatures must be above 0 K and at most {HOTTEST:g} K")
     if error is not None and not error > 0:
-        faults.append(f"the requested error must be above 0, not {error!r}")
-    if faults:
-        raise SceneError(SOURCE, faults)
+        errors.append(f"the requested error must be above 0, not {error!r}")
+    if errors:
+        raise SceneError(SOURCE, errors)
     guest, state = _guest_of(models, settings, forces, max(temperatures))
     alone = guest.constant(inf)  # its energy without the other one
     points = all(not m.positions_body.any() for m in models)

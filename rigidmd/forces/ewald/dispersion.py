@@ -79,10 +79,10 @@ def settings(forces: Forces, composition: Composition, cutoff: float | None) -> 
     grid, order = forces.dispersion_grid, forces.dispersion_order
     is_given_cell = np.array_equal(composition.basis, direct_sum.SAME_BASIS)
     if grid is not None and len(set(grid)) > 1 and not is_given_cell:
-        fault = f"the box is the equivalent cell with {composition.cell}: give three equal numbers"
+        error = f"the box is the equivalent cell with {composition.cell}: give three equal numbers"
         return Settings(
             numbers,
-            [f"forces.dispersion_grid = {list(grid)} refers to a cell with a large tilt; {fault}"],
+            [f"forces.dispersion_grid = {list(grid)} refers to a cell with a large tilt; {error}"],
         )
     if grid is None or order is None:
         grid_and_order = pme_grid_for(sites, beta, cell, part, order, grid)

@@ -114,16 +114,16 @@ def _settings_of_vectors(
         and forces.ewald_k_max is None
         and radius * longest > 2 * pi * MOST_K_VECTORS
     ):
-        fault = (
+        error = (
             f"forces.ewald_k_radius_per_A = {radius:g}{_default(forces.ewald_k_radius_per_A)} is"
             f" more than {MOST_K_VECTORS} k-vectors along an edge of the box"
         )
-        return Settings(numbers, [fault])
+        return Settings(numbers, [error])
     count = _number_of_k_vectors(forces, radius, composition.space.volume)
     if count > MOST_K_VECTORS_IN_ALL:
-        fault = f"needs about {count:.2g} k-vectors, more than {MOST_K_VECTORS_IN_ALL:.2g}"
+        error = f"needs about {count:.2g} k-vectors, more than {MOST_K_VECTORS_IN_ALL:.2g}"
         advice = "use pme, a lower accuracy, fewer k-vectors or a smaller box"
-        return Settings(numbers, [f"forces.electrostatics = 'ewald' {fault}: {advice}"])
+        return Settings(numbers, [f"forces.electrostatics = 'ewald' {error}: {advice}"])
     return Settings(numbers | {"ewald_k_radius_per_A": radius}, [])
 
 
@@ -144,25 +144,25 @@ def _settings_of_grid(
     grid, order = forces.pme_grid, forces.pme_order
     has_given_cell = np.array_equal(composition.basis, direct_sum.SAME_BASIS)
     if grid is not None and len(set(grid)) > 1 and not has_given_cell:
-        fault = (
+        error = (
             f"forces.pme_grid = {list(grid)} refers to the edges of a cell with a large tilt. The"
             f" box is the equivalent cell with {composition.cell}. Give this cell as the box, or"
             " three equal numbers, or leave pme_grid out"
         )
-        return Settings(numbers, [fault])
+        return Settings(numbers, [error])
     if grid is None or order is None:
         longest = np.linalg.norm(cell, axis=1).max()
         grid_and_order = pme_grid_for(composition.charges, alpha, cell, part, order, grid)
         if grid_and_order is None and longest > MAX_GRID_POINTS * COARSE_SPACING:
-            fault = f"an edge of {longest:.4g} Å is too long for a grid of {MAX_GRID_POINTS} points"
-            return Settings(numbers, [f"forces.electrostatics = 'pme': {fault}"])
+            error = f"an edge of {longest:.4g} Å is too long for a grid of {MAX_GRID_POINTS} points"
+            return Settings(numbers, [f"forces.electrostatics = 'pme': {error}"])
         if grid_and_order is None:
             settings_used = " with the given forces.pme_order or pme_grid" if order or grid else ""
-            fault = (
+            error = (
                 f"{unreachable}{settings_used} at alpha = {alpha:.3g} 1/Å. Use a lower accuracy or"
                 " a longer cutoff"
             )
-            return Settings(numbers, [fault])
+            return Settings(numbers, [error])
         grid, order = grid_and_order
     numbers["pme_order"] = order
     if has_given_cell or forces.pme_grid is not None:
@@ -326,10 +326,10 @@ def _checked_slab(parts: SystemParts, sites: BodySites | CentralSites, charge: n
     wrong geometries."""
     k = "xyz".index(parts.scene.forces.ewald_slab)
     cell = cell_of(parts.space)
-    faults = []
+    errors = []
     across = [i for i in range(3) if i != k]
     if cell[k, across].any() or cell[across, k].any():
-        faults.append("the edge along the normal must be at right angles to the others")
+        errors.append("the edge along the normal must be at right angles to the others")
     height = cell[k, k]
     lateral = float(np.linalg.norm(cell[across], axis=1).max())
     centre = parts.state.position[:, k]
@@ -342,18 +342,18 @@ def _checked_slab(parts: SystemParts, sites: BodySites | CentralSites, charge: n
         " longest edge across"
     )
     if gap < LEAST_VACUUM * lateral:
-        faults.append(
+        errors.append(
             f"{note}, which has to be at least {LEAST_VACUUM:g}: add vacuum, or leave"
             " ewald_slab out"
         )
     net = np.abs(np.bincount(sites.molecule, charge)) > NEUTRAL * np.abs(charge).max()
     if len(set(np.floor((centre[np.flatnonzero(net)] - boundary) / height))) > 1:
-        faults.append(
+        errors.append(
             "charged molecules are in different images of the slab: shift the structure until it is"
             " whole"
         )
-    if faults:
-        raise SceneError(parts.scene.source, [f"forces.ewald_slab: {fault}" for fault in faults])
+    if errors:
+        raise SceneError(parts.scene.source, [f"forces.ewald_slab: {error}" for error in errors])
     left = np.exp(-2 * pi * gap / lateral)
     return (
         f"ewald_slab: {note}; of the field at the surface, images along it have at most {left:.1g}"

@@ -58,28 +58,28 @@ def _centre_in(state: State, members: np.ndarray, fraction: np.ndarray) -> np.nd
 
 
 def distance_restraint(
-    parts: SystemParts, entry: Restraint, where: str, faults: list[str]
+    parts: SystemParts, entry: Restraint, where: str, errors: list[str]
 ) -> DistanceRestraint | None:
     """The term of one of fields.restraints with `between`."""
     state = parts.state
     n = len(parts.model.species)
-    before = len(faults)
+    before = len(errors)
     groups = [np.array(group) - 1 for group in entry.groups]
     if largest := [int(group.max()) + 1 for group in groups if group.max() >= n]:
-        faults.append(f"{where}.between: molecule {largest[0]} does not exist; there are 1 to {n}")
+        errors.append(f"{where}.between: molecule {largest[0]} does not exist; there are 1 to {n}")
         return None
     if any(len(np.unique(group)) < len(group) for group in groups) or np.isin(*groups).any():
-        faults.append(f"{where}.between: a molecule is named twice")
+        errors.append(f"{where}.between: a molecule is named twice")
     if not any(parts.moves[parts.model.species[group]].any() for group in groups):
-        faults.append(f"{where} would have no effect: all its molecules are frozen")
+        errors.append(f"{where} would have no effect: all its molecules are frozen")
     mass = [parts.model.mass[parts.model.species[group]] for group in groups]
     fractions = [of / of.sum() for of in mass]
     restraint = DistanceRestraint(
         *groups, *fractions, entry.distance_A, entry.stiffness[0] * KJ_PER_MOL
     )
     if np.isfinite(state.cell[0, 0]):
-        faults += _faults_in_box(restraint, parts, where)
-    return restraint if len(faults) == before else None
+        errors += _faults_in_box(restraint, parts, where)
+    return restraint if len(errors) == before else None
 
 
 def _faults_in_box(term: DistanceRestraint, parts: SystemParts, where: str) -> list[str]:
@@ -89,9 +89,9 @@ def _faults_in_box(term: DistanceRestraint, parts: SystemParts, where: str) -> l
     temperatures = [parts.scene.start.temperature_K or 0.0]
     temperatures += [value or 0.0 for stage in parts.scene.stages for value in stage.temperatures]
     barrier = 0.5 * term.stiffness * max(0.0, half - term.distance) ** 2
-    faults = []
+    errors = []
     if barrier <= LEAST_BARRIER * BOLTZMANN * max(temperatures):
-        faults.append(
+        errors.append(
             f"{where}.distance_A = {term.distance:g}: the distance may come near half the smallest"
             f" height of the box, {half:.6g} Å, where the nearest image changes. Use a larger box"
             " or a higher stiffness_kJ_mol_A2"
@@ -99,12 +99,12 @@ def _faults_in_box(term: DistanceRestraint, parts: SystemParts, where: str) -> l
     for group in (term.first, term.second):
         arms = nearest_images(parts.state.position[group] - parts.state.position[group[0]], cell)
         if (longest := float(np.linalg.norm(arms, axis=1).max())) > 0.5 * half:
-            faults.append(
+            errors.append(
                 f"{where}.between: molecules of a group are {longest:.3g} Å from its first one,"
                 f" more than a quarter of the smallest height of the box ({2 * half:.3g} Å): their"
                 " nearest images would change"
             )
-    return faults
+    return errors
 
 
 @kernel(inline=True)

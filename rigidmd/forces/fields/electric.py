@@ -58,7 +58,7 @@ class OscillatingField(NamedTuple):
 
 
 def term(
-    parts: SystemParts, fields: Fields, where: str, faults: list[str]
+    parts: SystemParts, fields: Fields, where: str, errors: list[str]
 ) -> ElectricField | OscillatingField | None:
     """The term of fields.electric_V_per_nm."""
     if not any(fields.electric_V_per_nm or ()):
@@ -69,7 +69,7 @@ def term(
     )
     present = np.unique(parts.model.species)
     if not (charge[present].any() or dipole[present].any()):
-        faults.append(f"{where} would have no effect: no molecule that moves has a charge")
+        errors.append(f"{where} would have no effect: no molecule that moves has a charge")
     steady = ElectricField(
         parts.model.species, charge, dipole, np.array(fields.electric_V_per_nm) * VOLT_PER_NM
     )

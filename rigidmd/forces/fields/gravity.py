@@ -29,7 +29,7 @@ class Gravity(NamedTuple):
         return self.acceleration != 0
 
 
-def term(parts: SystemParts, fields: Fields, where: str, faults: list[str]) -> Gravity | None:
+def term(parts: SystemParts, fields: Fields, where: str, errors: list[str]) -> Gravity | None:
     """The term of fields.gravity_m_s2."""
     if not any(fields.gravity_m_s2 or ()):
         return None

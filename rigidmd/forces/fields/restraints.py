@@ -32,11 +32,11 @@ class Restraints(NamedTuple):
 
 
 def term(
-    parts: SystemParts, entry: Restraint, where: str, faults: list[str]
+    parts: SystemParts, entry: Restraint, where: str, errors: list[str]
 ) -> "Restraints | DistanceRestraint | None":
     """The term of one of fields.restraints."""
     if entry.between is not None:
-        return distance_restraint(parts, entry, where, faults)
+        return distance_restraint(parts, entry, where, errors)
     index = parts.model.species
     names = list(dict.fromkeys(m.name for m in parts.species))
     name = entry.species or names[0]
@@ -51,21 +51,21 @@ def term(
         else ""
     )
     if wrong:
-        faults.append(f"{where}.species{wrong}")
+        errors.append(f"{where}.species{wrong}")
         return None
     moves = parts.moves[index]
     restrained = of_species & moves if entry.molecules is None else np.zeros(len(moves), bool)
-    for numbers, mask, fault in select_by_number(entry.spans, name, of_species, parts.number):
-        if fault:
-            faults.append(f"{where}.molecules: {fault}")
+    for numbers, mask, error in select_by_number(entry.spans, name, of_species, parts.number):
+        if error:
+            errors.append(f"{where}.molecules: {error}")
         elif not moves[mask].all():
-            faults.append(
+            errors.append(
                 f"{where}.molecules: {numbers} includes frozen molecules, which do not move"
             )
         restrained |= mask
     if not restrained.any():
         if entry.molecules is None:
-            faults.append(f"{where} would have no effect: all {name} are frozen")
+            errors.append(f"{where} would have no effect: all {name} are frozen")
         return None
     molecule = np.flatnonzero(restrained)
     position = (

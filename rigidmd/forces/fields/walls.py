@@ -80,13 +80,13 @@ class HarmonicWalls(NamedTuple):
 
 
 def term(
-    parts: SystemParts, walls: Walls, where: str, faults: list[str]
+    parts: SystemParts, walls: Walls, where: str, errors: list[str]
 ) -> LennardJonesWalls | HarmonicWalls:
     """The term of one of fields.walls. The messages on the gap between walls follow those on the
     last of them."""
     points = _acted_on(walls, parts.species, parts.moves)
     index = parts.model.species
-    faults += [
+    errors += [
         f"{where}: {m.name} has no site with Lennard-Jones parameters, and would pass the walls. "
         "Use acts_on = 'centres'"
         for m, offsets, free in zip(parts.species, points, parts.moves, strict=True)
@@ -102,11 +102,11 @@ def term(
         term_of_walls = LennardJonesWalls(*positions, walls.sigma_A, epsilon, cutoff, sites)
         if (behind := term_of_walls.behind(parts.state)) is not None:
             m, reason = behind
-            faults.append(
+            errors.append(
                 f"{where}: at the start, molecule {m + 1} ({parts.species[index[m]].name}) {reason}"
             )
     if walls is parts.scene.fields.walls[-1]:
-        faults += _gap_errors(parts)
+        errors += _gap_errors(parts)
     return term_of_walls
 
 
@@ -142,7 +142,7 @@ def _gap_errors(parts: SystemParts) -> list[str]:
         return []
     if not isinstance(space, Orthorhombic):
         return ["fields.walls need a box with right angles, or none"]
-    faults = []
+    errors = []
     cutoff = parts.scene.forces.cutoff_A or inf
     for axis, name in enumerate("xyz"):
         if (bounds := fields.bounds(axis)) is None:
@@ -155,13 +155,13 @@ def _gap_errors(parts: SystemParts) -> list[str]:
         least = width + 2 * protrusion + cutoff
         if edge < least:
             sites = f", {2 * protrusion:.3g} Å by which sites may protrude," if protrusion else ""
-            faults.append(
+            errors.append(
                 f"fields.walls: along {name} the box is {edge:g} Å, and must be {least:.6g} Å at"
                 f" least: {width:g} Å between the walls{sites} and the cutoff of {cutoff:g} Å, so"
                 " that molecules at one wall do not interact with periodic images of molecules at"
                 " the other"
             )
-    return faults
+    return errors
 
 
 def _protrusion(walls: Walls, parts: SystemParts) -> float:

@@ -255,7 +255,7 @@ def _sites_of_pairs(parts: SystemParts) -> list[np.ndarray]:
     means the site. Raises SceneError."""
     entries = parts.scene.forces.pairs
     species = parts.species
-    faults = []
+    errors = []
     is_meant = [np.zeros((len(entries), 2, len(m.site_names)), bool) for m in species]
     for n, entry in enumerate(entries):
         for side, text in enumerate(entry.sites):
@@ -264,11 +264,11 @@ def _sites_of_pairs(parts: SystemParts) -> list[np.ndarray]:
                 is_meant[k][n, side] = mask
             if not any(mask.any() for mask in masks):
                 known = dict.fromkeys(f"{m.name}.{site}" for m in species for site in m.site_names)
-                faults.append(
+                errors.append(
                     f"forces.pairs.{n}.sites: no site is {text!r}; there are {', '.join(known)}"
                 )
-    if faults:
-        raise SceneError(parts.scene.source, faults)
+    if errors:
+        raise SceneError(parts.scene.source, errors)
     return is_meant
 
 

@@ -148,28 +148,28 @@ class SolidPart(Solid):
     x_solid"""
 
     def _errors(self):
-        faults = [*super()._errors()]
+        errors = [*super()._errors()]
         ways = [key for key in ("mass_kg", "density_kg_m3") if getattr(self, key) is not None]
         if len(ways) != 1:
-            faults.append("give mass_kg or density_kg_m3" + (", not both" if ways else ""))
+            errors.append("give mass_kg or density_kg_m3" + (", not both" if ways else ""))
         elif ways == ["density_kg_m3"] and SOLIDS[self.shape].volume == 0:
-            faults.append(f"a {self.shape} has no volume: give mass_kg instead of density_kg_m3")
-        elif not faults and not Scene.SIZES[0] <= self.mass <= Scene.SIZES[1]:
-            faults.append(
+            errors.append(f"a {self.shape} has no volume: give mass_kg instead of density_kg_m3")
+        elif not errors and not Scene.SIZES[0] <= self.mass <= Scene.SIZES[1]:
+            errors.append(
                 f"its mass is {self.mass:g} kg, must be between {Scene.SIZES[0]:g} and"
                 f" {Scene.SIZES[1]:g}"
             )
         if self.axis is not None and self.euler_angles_deg is not None:
-            faults.append("give axis or euler_angles_deg, not both")
+            errors.append("give axis or euler_angles_deg, not both")
         elif self.axis is not None and self.shape in WITHOUT_AXIS:
             rotation = (
                 f"{'an' if self.shape == 'ellipsoid' else 'a'} {self.shape} may be rotated about"
                 " its axis"
             )
-            faults.append(f"axis is not enough, as {rotation}: give euler_angles_deg")
+            errors.append(f"axis is not enough, as {rotation}: give euler_angles_deg")
         elif self.axis is not None and not any(self.axis):
-            faults.append("axis is zero, which is not a direction")
-        return faults
+            errors.append("axis is zero, which is not a direction")
+        return errors
 
     @property
     def mass(self) -> float:
@@ -227,7 +227,7 @@ class BodyTable(Section):
         has_centre = self.centre_of_mass_m is not None
         about_pivot = self.inertia_about == "pivot"
         has_mass = self.mass_kg is not None
-        faults = {
+        errors = {
             f"give one of {', '.join(ways)}": len(ways) > 1,
             "mass_kg is missing": not (has_parts or has_mass),
             f"mass_kg would have no effect: the {parts} have masses": has_parts and has_mass,
@@ -243,7 +243,7 @@ class BodyTable(Section):
                 about_pivot and ways[:1] in (["solid"], ["solids"], ["points"])
             ),
         }
-        messages = [fault for fault, is_there in faults.items() if is_there]
+        messages = [error for error, is_there in errors.items() if is_there]
         tensor = self.tensor
         if messages or tensor is None or self.mass_kg is None:
             return messages
@@ -558,7 +558,7 @@ class BodyScene(Scene):
             messages.append(
                 (["frame"], "a fluid at rest and an accelerated frame together are not supported")
             )
-        return [f"{location_of(keys, text)}: {fault}" for keys, fault in messages]
+        return [f"{location_of(keys, text)}: {error}" for keys, error in messages]
 
     def _errors(self):
         fluid, body = self.fluid, self.body
