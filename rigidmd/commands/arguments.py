@@ -221,7 +221,7 @@ def write_study(
     begins: str,
     measure: Callable[[Callable], Result],
     describe: Callable[[Result], list[str]],
-    write: Callable[[Path, Result, str], list[Path]],
+    write: Callable[[Path, Result, str], object],
 ) -> Result:
     """Measure something, print it and write its files into a folder, which is locked meanwhile.
     Returns what was found.
@@ -237,8 +237,9 @@ def write_study(
             result = measure(progress)
         print(*describe(result), sep="\n")
         make_folder(folder, files, lock)
-        written = write(folder, result, shlex.join(["rigidmd", *sys.argv[1:]]))
-    print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")
+        write(folder, result, shlex.join(["rigidmd", *sys.argv[1:]]))
+    written = [name for name in files if (folder / name).is_file()]
+    print(f"\n  files in {folder}: {', '.join(written)}")
     return result
 
 

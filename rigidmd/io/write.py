@@ -122,7 +122,7 @@ def with_error(
     ]
 
 
-class Table(NamedTuple, Generic[Row]):
+class ReportTable(NamedTuple, Generic[Row]):
     columns: list[Column[Row]]
     rows: Sequence[Row]
 

@@ -80,6 +80,10 @@ class TrialSystem:
     rounding: tuple[float, float] | None = None
     chooses_precision: bool = False
 
+    @property
+    def span_unit(self) -> str:
+        return "ps" if self.time_unit == "fs" else "s"
+
 
 @dataclass
 class Trial:

@@ -17,8 +17,6 @@ from rigidmd.core.statistics import (
     steady_from,
 )
 from rigidmd.core.statistics import mean_and_error as mean
-from rigidmd.features.studies.accuracy.averages import AveragedQuantity, AverageRun, Averages
-from rigidmd.features.studies.accuracy.averages_report import brief_table, describe_failures
 from rigidmd.run.summary import drift_of_thermostats
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
@@ -166,19 +164,6 @@ def test_values_without_an_error_are_printed_as_such():
         == format_signed(1.5, float("nan"))
     )
     assert format_signed(1.5, 0.25) == "+1.50 ± 0.25"
-    quantities = [
-        AveragedQuantity("U", "kJ/mol", 2.5),
-        AveragedQuantity("T_trans", "K", 300.0, 300.0),
-    ]
-    run = AverageRun(
-        "baoab", "langevin", 2.0, 500.0, averages={"T_trans": (300.5, 1.0)}, short=["U", "density"]
-    )
-    found = Averages("scene", "nvt", 300.0, 10, 60, 5.0, quantities, [run])
-    (told,) = describe_failures(found)
-    assert told == (
-        "baoab + langevin at 2 fs: U: 5 ps are too short for an error. Sample longer (--sample-ps)"
-    )  # of what is reported
-    assert brief_table(found).shown()[1][0][-2:] == ["-", "+0.5 ± 1.0"]
 
 
 def test_inefficiency_of_correlated_samples():

@@ -70,7 +70,7 @@ TESTED_BY = {
     " features/potentials/user_code/compiled features/potentials/user_code/trust core/user_modules"
     " features/potentials/user_code/kernels features/potentials/extra features/potentials/feature"
     " features/potentials/keys scene/added_forces scene/table_in_file",
-    "features/studies/accuracy/test_averages.py": "features/studies/accuracy/averages_report",
+    "features/studies/accuracy/test_averages.py": "features/studies/accuracy/start",
     "features/studies/sweep/test_sweeping.py": "features/studies/commands/compare features/studies/commands/sweep features/studies/compare"
     " features/studies/sweep/folder"
     " features/studies/sweep/replicas",

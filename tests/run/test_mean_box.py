@@ -8,7 +8,7 @@ from support.common import small_scene
 from support.stops import same_after_stops
 
 from rigidmd.errors import SceneError
-from rigidmd.features.studies.accuracy.averages import start_of_last_stage
+from rigidmd.features.studies.accuracy.start import start_of_last_stage
 from rigidmd.run import Simulation
 from rigidmd.run.report import summary_text
 from rigidmd.scene import Scene

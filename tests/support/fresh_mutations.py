@@ -295,12 +295,12 @@ FRESH: list[Mutation] = [
     ),
     Mutation(
         "F33",
-        "averages against the step: what comes before equilibrium counts",
+        "averages against the step: all pairs of integrators and thermostats run",
         "features/studies/accuracy/averages.py",
-        '    late = results["time"] > EQUILIBRATION * sample',
-        '    late = results["time"] > 0',
+        "        return tuple(found) in self.methods",
+        "        return True",
         (
-            "features/studies/accuracy/test_averages.py::test_averages_leave_out_what_comes_before_equilibrium",
+            "features/studies/accuracy/test_averages.py::test_methods_and_steps_that_are_averaged_by_default",
         ),
     ),
     Mutation(
@@ -737,10 +737,10 @@ FRESH: list[Mutation] = [
     ),
     Mutation(
         "F83",
-        "averages against the step: the error of a bias is not in the unit of the bias",
-        "features/studies/accuracy/averages.py",
-        "return value / quantity.bias_size, error / quantity.bias_size",
-        "return value / quantity.bias_size, error",
+        "averages against the step: the step of a bias is that of order 2 for all methods",
+        "features/studies/sweep/limits.py",
+        "** (1 / self.order)",
+        "** (1 / 2)",
         (
             "features/studies/test_extrapolation.py::test_the_step_of_a_bias_that_is_not_seen_allows_for_its_error",
         ),

@@ -19,7 +19,7 @@ from rigidmd.core.state import State, state_of
 from rigidmd.core.statistics import error_of_mean
 from rigidmd.errors import RigidMDWarning, SceneError, SimulationError
 from rigidmd.features.free_energy.guest import Guest, model_named
-from rigidmd.io.write import Column, Table
+from rigidmd.io.write import Column, ReportTable
 from rigidmd.mechanics.rotation import from_quaternion
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import Molecule
@@ -75,18 +75,18 @@ class SecondVirial:
     dB2_dT_error: np.ndarray
     samples: int
 
-    def table(self) -> Table:
+    def table(self) -> ReportTable:
         return table_of([self])
 
 
-def table_of(results: Sequence[SecondVirial]) -> Table:
+def table_of(results: Sequence[SecondVirial]) -> ReportTable:
     """Rows of all pairs at all temperatures."""
     rows = [(result, k) for result in results for k in range(len(result.temperature))]
 
     def column(header: str, name: str) -> Column:
         return Column(header, lambda row: float(getattr(row[0], name)[row[1]]))
 
-    return Table(
+    return ReportTable(
         [
             Column("species", lambda row: "-".join(row[0].species)),
             column("T (K)", "temperature"),

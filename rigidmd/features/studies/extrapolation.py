@@ -23,6 +23,12 @@ class MeanAtStep(NamedTuple):
     timestep: float  # fs
     mean: float
     error: float
+    order: int = 2  # of the method
+
+    @property
+    def power(self) -> float:
+        """dt^order."""
+        return self.timestep**self.order
 
 
 class BiasFit(NamedTuple):
@@ -33,7 +39,6 @@ class BiasFit(NamedTuple):
     slopes: dict[str, tuple[float, float]]  # method -> slope and its error, per fs^order
     weights: dict[MeanAtStep, float]  # of the points in the limit, which is their weighted sum
     longest: float  # fs
-    order: int = 2
     chi2: float = 0.0
     freedom: int = 0  # degrees of freedom of chi²: points less fitted numbers
 
@@ -48,62 +53,72 @@ class BiasFit(NamedTuple):
         return format_signed(self.limit, self.limit_error).lstrip("+")
 
 
-def extrapolate(
-    points: Sequence[MeanAtStep], exact: float | None = None, order: int = 2
-) -> BiasFit:
+def extrapolate(points: Sequence[MeanAtStep]) -> BiasFit:
     """The limit of means at zero time step, from all methods at once and from the short steps that
     dt^order describes.
 
     Long steps are omitted one by one while chi² exceeds its mean by more than two of its standard
-    deviations and
-    enough points are left. exact : the limit, where it is known. Raises ValueError without points.
+    deviations and enough points are left. Raises ValueError without points.
     """
     steps = sorted({point.timestep for point in points}, reverse=True)
-    fits = [fit for longest in steps if (fit := _fit(points, longest, exact, order)) is not None]
-    for fit in fits:
-        if fit.freedom == 0 or fit.chi2 <= fit.freedom + 2 * sqrt(2 * fit.freedom):
-            return fit
+    fits = [fit for longest in steps if (fit := _fit(points, longest)) is not None]
     if fits:
-        fit = fits[-1]
-        return fit._replace(limit_error=fit.limit_error * sqrt(fit.chi2 / fit.freedom))
+        return first_good([[fit] for fit in fits])[0]
     best = min(points, key=lambda point: (point.timestep, point.error))
-    return BiasFit(best.mean, best.error, {}, {best: 1.0}, best.timestep, order)
+    return BiasFit(best.mean, best.error, {}, {best: 1.0}, best.timestep)
 
 
-def _fit(
-    points: Sequence[MeanAtStep], longest: float, exact: float | None, order: int
-) -> BiasFit | None:
+def first_good(fits: Sequence[list[BiasFit]]) -> list[BiasFit]:
+    """The first of several fits, each of some quantities with one chi², whose chi² is as expected.
+    If there is none, the last one, with errors as large as chi² shows."""
+    for of_all in fits:
+        chi2, freedom = of_all[0].chi2, of_all[0].freedom
+        if freedom == 0 or chi2 <= freedom + 2 * sqrt(2 * freedom):
+            return of_all
+    factor = sqrt(fits[-1][0].chi2 / fits[-1][0].freedom)
+    return [fit._replace(limit_error=factor * fit.limit_error) for fit in fits[-1]]
+
+
+class LeastSquares(NamedTuple):
+    """The solution of linear equations (values, unknowns) whose values have errors of 1.
+
+    inverse : (unknowns, values), of which the solution is the product with the values
+    """
+
+    solution: list[float]
+    errors: list[float]
+    chi2: float
+    inverse: np.ndarray
+
+
+def least_squares(design: np.ndarray, values: np.ndarray) -> LeastSquares:
+    size = np.linalg.norm(design, axis=0)
+    inverse = np.linalg.pinv(design / size) / size[:, None]
+    solution = inverse @ values
+    chi2 = float(((values - design @ solution) ** 2).sum())
+    errors = np.linalg.norm(inverse, axis=1)
+    return LeastSquares(solution.tolist(), errors.tolist(), chi2, inverse)
+
+
+def _fit(points: Sequence[MeanAtStep], longest: float) -> BiasFit | None:
     """Weighted least squares over steps up to the longest. None with too few points."""
     points = [point for point in points if point.timestep <= longest]
     methods = list(dict.fromkeys(point.method for point in points))
     columns = [
-        [float(point.method == name) * point.timestep**order for point in points]
-        for name in methods
+        [1.0] * len(points),
+        *([(point.method == name) * point.power for point in points] for name in methods),
     ]
-    if exact is None:
-        columns.insert(0, [1.0] * len(points))
     if len(points) < len(columns):
         return None
     error = np.array([point.error for point in points])
     error = np.maximum(error, 1e-9 * error.max(initial=0.0) or 1.0)
-    design = np.array(columns).T / error[:, None]
-    value = np.array([point.mean for point in points]) - (exact or 0.0)
-    size = np.linalg.norm(design, axis=0)
-    inverse = np.linalg.pinv(design / size) / size[:, None]
-    found = inverse @ (value / error)
-    chi2 = float(((value / error - design @ found) ** 2).sum())
+    means = np.array([point.mean for point in points])
+    fitted = least_squares(np.array(columns).T / error[:, None], means / error)
+    weights = dict(zip(points, (fitted.inverse[0] / error).tolist(), strict=True))
+    limit, *slopes = zip(fitted.solution, fitted.errors, strict=True)
     freedom = len(points) - len(columns)
-    errors = np.linalg.norm(inverse, axis=1)
-    if exact is None:
-        limit, limit_error = float(found[0]), float(errors[0])
-        weights = dict(zip(points, (inverse[0] / error).tolist(), strict=True))
-        found, errors = found[1:], errors[1:]
-    else:
-        limit = exact
-        limit_error = 0.0
-        weights = {}
-    slopes = {name: (float(b), float(e)) for name, b, e in zip(methods, found, errors, strict=True)}
-    return BiasFit(limit, limit_error, slopes, weights, longest, order, chi2, freedom)
+    of_methods = dict(zip(methods, slopes, strict=True))
+    return BiasFit(*limit, of_methods, weights, longest, fitted.chi2, freedom)
 
 
 class Together(NamedTuple):

@@ -16,7 +16,14 @@ from rigidmd.dynamics.model import mobile
 from rigidmd.engines.samples import IN_LOGS
 from rigidmd.engines.system import System
 from rigidmd.features.analysis.rigid_frames import production_samples
-from rigidmd.features.studies.extrapolation import BiasFit, MeanAtStep, extrapolate, means_of_runs
+from rigidmd.features.studies.extrapolation import (
+    BiasFit,
+    MeanAtStep,
+    extrapolate,
+    first_good,
+    least_squares,
+    means_of_runs,
+)
 from rigidmd.run.record import Record
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
@@ -351,27 +358,16 @@ class _Step(NamedTuple):
 def _fit_with_slopes(steps: Sequence[_Step]) -> list[BiasFit]:
     """Generalised least squares. Long steps are omitted as in `extrapolate`."""
     steps = sorted(steps, key=lambda step: step.step)
-    fits = [_fit_steps(steps[:count]) for count in range(len(steps), 0, -1)]
-    for of_all in fits:
-        chi2, freedom = of_all[0].chi2, of_all[0].freedom
-        if chi2 <= freedom + 2 * sqrt(2 * freedom):
-            return of_all
-    last = fits[-1]
-    factor = sqrt(last[0].chi2 / last[0].freedom)
-    return [fit._replace(limit_error=factor * fit.limit_error) for fit in last]
+    return first_good([_fit_steps(steps[:count]) for count in range(len(steps), 0, -1)])
 
 
 def _fit_steps(steps: Sequence[_Step]) -> list[BiasFit]:
     designs, values = zip(*(step.whitened() for step in steps), strict=True)
-    design, value = np.vstack(designs), np.concatenate(values)
-    scale = np.linalg.norm(design, axis=0)
-    inverse = np.linalg.pinv(design / scale) / scale[:, None]
-    found = inverse @ value
-    errors = np.linalg.norm(inverse, axis=1)
-    chi2 = float(((value - design @ found) ** 2).sum())
+    fitted = least_squares(np.vstack(designs), np.concatenate(values))
     size, longest = steps[0].size, steps[-1].step
-    numbers = [*zip(found.tolist(), errors.tolist(), strict=True)]
+    numbers = [*zip(fitted.solution, fitted.errors, strict=True)]
+    freedom = len(fitted.inverse[0]) - 2 * size
     return [
-        BiasFit(*limit, {"": slope}, {}, longest, 2, chi2, len(value) - 2 * size)
+        BiasFit(*limit, {"": slope}, {}, longest, fitted.chi2, freedom)
         for limit, slope in zip(numbers[:size], numbers[size:], strict=True)
     ]

@@ -24,7 +24,7 @@ from rigidmd.features.studies.gamma_point import cells_of, periodic_basis
 from rigidmd.io.folder import LOG, SCENE, SUMMARY
 from rigidmd.io.run_files import Log
 from rigidmd.io.scene_file import input_names, write_scene
-from rigidmd.io.write import Column, Table, write_json
+from rigidmd.io.write import Column, ReportTable, write_json
 from rigidmd.run import Simulation
 from rigidmd.run.checks import molecule_label
 from rigidmd.run.minimise import Enthalpy
@@ -182,13 +182,13 @@ class NormalModes:
         """Whether the mode of this number was computed and has a frequency."""
         return bool(self.rate[self.number == number].any())
 
-    def table(self) -> Table:
+    def table(self) -> ReportTable:
         """The modes with their properties. Zero modes, which mix freely, have none."""
 
         def of(values: np.ndarray) -> Callable[[int], float | None]:
             return lambda k: float(values[k]) if self.rate[k] else None
 
-        return Table(
+        return ReportTable(
             [
                 Column("mode", lambda k: str(self.number[k])),
                 Column("kind", self.kind),

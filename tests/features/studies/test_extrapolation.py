@@ -3,13 +3,8 @@
 import numpy as np
 import pytest
 
-from rigidmd.features.studies.accuracy.averages import (
-    UNSEEN,
-    AveragedQuantity,
-    AverageRun,
-    Averages,
-)
 from rigidmd.features.studies.extrapolation import MeanAtStep, Together, extrapolate, means_of_runs
+from rigidmd.features.studies.sweep.limits import BIAS_LIMIT, UNSEEN, Limit
 
 
 def test_the_limit_at_a_step_of_zero_is_shared_and_long_steps_are_left_out():
@@ -27,9 +22,6 @@ def test_the_limit_at_a_step_of_zero_is_shared_and_long_steps_are_left_out():
     assert extrapolate([*points, wild]) == fit
     assert fit.bias(wild)[0] == pytest.approx(0.3 * 36 + 0.02 * 6**4)
     assert fit.bias(wild)[1] == pytest.approx(np.hypot(error, fit.limit_error))
-    known = extrapolate(points, exact=4.9)
-    assert (known.limit, known.limit_error) == (4.9, 0.0)
-    assert known.bias(points[0]) == pytest.approx((points[0].mean - 4.9, error))
     alone = extrapolate([MeanAtStep("a", 2.0, 7.0, 0.1), MeanAtStep("b", 4.0, 8.0, 0.1)])
     assert (alone.limit, alone.limit_error, alone.slopes) == (7.0, 0.1, {})
     assert alone.bias(MeanAtStep("a", 2.0, 7.0, 0.1)) == (0.0, 0.0)
@@ -60,14 +52,20 @@ def test_errors_of_a_limit_and_of_biases_are_those_of_repeated_measurements():
 
 
 def test_a_fit_has_its_chi2_and_the_order_of_the_integrator():
-    points = [MeanAtStep("a", dt, 1 + 0.02 * dt**4, 0.1) for dt in (1.0, 2.0, 4.0)]
+    """Each of two methods has its own order."""
+    orders, slopes = {"a": 4, "b": 2}, {"a": 0.02, "b": -0.3}
+    points = [
+        MeanAtStep(name, dt, 1 + slopes[name] * dt**order, 0.1, order)
+        for name, order in orders.items()
+        for dt in (1.0, 2.0, 4.0)
+    ]
     points[1] = points[1]._replace(mean=points[1].mean + 0.1)
-    fit = extrapolate(points, order=4)
-    assert fit.order == 4
-    assert fit.freedom == 1
-    assert 0 < fit.chi2 < 1
+    fit = extrapolate(points)
+    assert fit.freedom == 3
+    assert 0 < fit.chi2 < 3
     assert fit.limit == pytest.approx(1, abs=0.1)
-    assert fit.slopes["a"][0] == pytest.approx(0.02, rel=0.02)
+    for name, slope in slopes.items():
+        assert fit.slopes[name][0] == pytest.approx(slope, rel=0.05)
     assert extrapolate(points[:2]).freedom == 0
 
 
@@ -102,25 +100,18 @@ def test_points_that_no_fit_describes_make_the_error_of_the_limit_larger():
     ("slope", "error", "seen"), [(0.1, 1.0, False), (-0.1, 0.5, False), (2.0, 0.1, True)]
 )
 def test_the_step_of_a_bias_that_is_not_seen_allows_for_its_error(slope, error, seen):
-    """Means 5 + slope dt² of two steps whose errors give the slope this error."""
+    """Means 5 + slope dt^p of two steps whose errors give the slope this error."""
     steps = np.array([1.0, 2.0])
-    of_mean = error * (steps[1] ** 2 - steps[0] ** 2) / np.sqrt(2)
-    runs = [
-        AverageRun("baoab", "langevin", dt, 1.0, averages={"U": (5 + slope * dt**2, of_mean)})
-        for dt in steps
-    ]
-    quantity = AveragedQuantity("U", "kJ/mol", 2.5, bias_unit="kT", bias_size=2.5)
-    found = Averages("scene", "nvt", 300.0, 10, 60, 5.0, [quantity], runs)
-    fit = found.fit(quantity)
-    of_point = np.array(fit.bias(found.point(runs[1], quantity)))
-    assert np.array(found.bias(runs[1], quantity)) == pytest.approx(of_point / 2.5)
-    assert fit.slopes["baoab + langevin"] == pytest.approx((slope, error))
-    steepest = abs(slope) + (0.0 if seen else UNSEEN * error)
-    step, was_seen = found.step_at_limit("baoab + langevin", quantity)
-    assert was_seen is seen
-    assert step == pytest.approx(
-        np.sqrt(found.bias_limit(quantity) * quantity.bias_size / steepest)
-    )
+    for order in (2, 4):
+        of_mean = error * (steps[1] ** order - steps[0] ** order) / np.sqrt(2)
+        points = [MeanAtStep("a", dt, 5 + slope * dt**order, of_mean, order) for dt in steps]
+        fit = extrapolate(points)
+        assert fit.slopes["a"] == pytest.approx((slope, error))
+        limit = Limit({}, "baoab", "U", points, fit, scale=250.0)
+        steepest = abs(slope) + (0.0 if seen else UNSEEN * error)
+        step = (BIAS_LIMIT * 250.0 / steepest) ** (1 / order)
+        assert limit.step_at_limit == f"{'' if seen else '> '}{step:.2g}"
+        assert limit._replace(scale=None).step_at_limit is None
 
 
 @pytest.mark.parametrize(
@@ -174,8 +165,8 @@ def test_means_of_few_runs_without_errors_are_left_out():
     values = [(1.0, None), (1.2, None)]
     assert means_of_runs({1.0: values, 2.0: values}) == []
     known = means_of_runs({1.0: [(1.0, 0.3), (1.2, 0.4)], 2.0: [(1.5, 0.3)]})
-    assert known[0][1:] == pytest.approx((1.0, 1.1, np.sqrt((0.09 + 0.16) / 2 / 2)))
-    assert known[1][1:] == (2.0, 1.5, 0.3)
+    assert known[0][1:4] == pytest.approx((1.0, 1.1, np.sqrt((0.09 + 0.16) / 2 / 2)))
+    assert known[1][1:4] == (2.0, 1.5, 0.3)
 
 
 def test_a_value_of_runs_together_replaces_the_mean_of_their_values():

@@ -2,6 +2,7 @@
 of a scene. As a table, recommendations, accuracy.csv, .png and a self-contained page."""
 
 from collections.abc import Callable, Iterator
+from operator import attrgetter
 from pathlib import Path
 from typing import cast
 
@@ -9,14 +10,14 @@ import numpy as np
 
 from rigidmd.core.integrators import RADAU, SCHEMES
 from rigidmd.errors import SceneError, option
-from rigidmd.features.studies.accuracy.averages import (
+from rigidmd.features.studies.accuracy.measurement import IntegratorAccuracy, measure, plan
+from rigidmd.features.studies.accuracy.orders import ENERGY, FLOOR_MARK, order_table, with_marks
+from rigidmd.features.studies.accuracy.start import (
     check_engine_is_rigidmd,
     check_number_of_steps,
     check_times,
     start_of_last_stage,
 )
-from rigidmd.features.studies.accuracy.measurement import IntegratorAccuracy, measure, plan
-from rigidmd.features.studies.accuracy.orders import FLOOR_MARK, order_table, with_marks
 from rigidmd.features.studies.kind_study import AccuracyStart, study_of
 from rigidmd.features.view.figures.style import (
     FAINT,
@@ -28,7 +29,7 @@ from rigidmd.features.view.figures.style import (
     write_figure,
 )
 from rigidmd.features.view.page import chips, code, items, section, table, wide, write_page
-from rigidmd.io.write import Column, Table, columns_text
+from rigidmd.io.write import Column, ReportTable, columns_text
 from rigidmd.run.force_errors import single_precision_errors
 from rigidmd.run.trial_systems import (
     COMPARATORS,
@@ -152,10 +153,13 @@ LABEL = (0.14, 0.045)  # width and height of the label of a step, as fractions o
 DOUBTFUL = 0.2  # spread of repeated timings that causes a warning
 
 
-def trial_table(measured: IntegratorAccuracy) -> Table:
-    """A row for each trial: its cost, the errors of Q, X, and of all conserved quantities."""
+def trial_table(measured: IntegratorAccuracy, *, marked: bool = False) -> ReportTable:
+    """A row for each trial: its cost, the errors of Q, X, and of all conserved quantities.
+
+    marked : whether errors at their floor have a mark
+    """
     s = measured.trial_system
-    per = "ps" if s.time_unit == "fs" else "s"
+    per = s.span_unit
 
     def column(header: str, value: Callable[[Trial], float | None], short: str = "") -> Column:
         def known(trial: Trial) -> float | None:
@@ -164,8 +168,12 @@ def trial_table(measured: IntegratorAccuracy) -> Table:
 
         return Column(header, known, short)
 
+    def error(header: str, name: str, short: str) -> Column:
+        plain = column(header, attrgetter(name), short)
+        return with_marks(measured, name, plain) if marked else plain
+
     others = dict.fromkeys(name for trial in measured.trials for name in trial.conserved_errors)
-    return Table(
+    return ReportTable(
         [
             Column("integrator", lambda t: t.integrator),
             Column(f"step ({s.time_unit})", lambda t: t.timestep),
@@ -176,11 +184,9 @@ def trial_table(measured: IntegratorAccuracy) -> Table:
                 f"s/{per}",
             ),
             column("spread (%)", lambda t: t.spread and 100 * t.spread, "± %"),
-            column("error of Q", lambda t: t.rotation_error, "Q"),
-            column(
-                f"error of X ({s.length_unit})", lambda t: t.position_error, f"X ({s.length_unit})"
-            ),
-            column("energy rms", lambda t: t.energy_rms, "energy"),
+            error("error of Q", "rotation_error", "Q"),
+            error(f"error of X ({s.length_unit})", "position_error", f"X ({s.length_unit})"),
+            error("energy rms", ENERGY, "energy"),
             column("energy drift in the span", lambda t: t.energy_drift, "drift"),
             column("±", lambda t: t.energy_drift_error),
             *(
@@ -193,11 +199,6 @@ def trial_table(measured: IntegratorAccuracy) -> Table:
     )
 
 
-def table_text(measured: IntegratorAccuracy) -> str:
-    text = "errors of Q, X, the energy (rms, drift over the span) and other conserved quantities\n"
-    return text + trial_table(measured).text()
-
-
 def describe_accuracy(measured: IntegratorAccuracy, *, verbose: bool = False) -> list[str]:
     """The answer first: the fastest integrator for each error, measured orders, all trials, and
     remarks."""
@@ -205,15 +206,12 @@ def describe_accuracy(measured: IntegratorAccuracy, *, verbose: bool = False) ->
     for error, best, faster, _ in cheapest(measured):
         gain, _, _ = faster.partition(f" than {COMMON}")
         fastest.append((error.removeprefix("an "), best, gain))
-    marked = with_marks(measured, trial_table(measured))
     lines = [f"{measured.trial_system.name}, {_span(measured)}", ""]
     if len(fastest) > 1:
         lines += [columns_text(fastest, left=(0, 1, 2)), ""]
-    lines += [order_table(measured).text(), "", marked.text()]
+    lines += [order_table(measured).text(), "", trial_table(measured, marked=True).text()]
     lines.append(f"{FLOOR_MARK} at the floor: a shorter step does not reduce this error")
-    if verbose:
-        return [*lines, "", *recommendations(measured)]
-    return [*lines, "", *remarks(measured)]
+    return [*lines, "", *(recommendations(measured) if verbose else remarks(measured))]
 
 
 def recommendations(measured: IntegratorAccuracy) -> list[str]:
@@ -233,9 +231,7 @@ def recommendations(measured: IntegratorAccuracy) -> list[str]:
 
 
 def _span(measured: IntegratorAccuracy) -> str:
-    return (
-        f"{measured.trial_system.span:g} {'ps' if measured.trial_system.time_unit == 'fs' else 's'}"
-    )
+    return f"{measured.trial_system.span:g} {measured.trial_system.span_unit}"
 
 
 def remarks(measured: IntegratorAccuracy) -> list[str]:
@@ -261,14 +257,12 @@ def remarks(measured: IntegratorAccuracy) -> list[str]:
             f"mixed precision: forces differ from double ones by {force:.1e} of their rms{torques};"
             f" {which}"
         )
-    for name in dict.fromkeys(t.integrator for t in measured.trials):
+    for name in measured.integrators:
         failures = [t.failure for t in measured.trials if t.integrator == name and t.failure]
         if "diverges" in failures:
-            step = measured.stable_step(name)
-            lines.append(
-                f"{name} diverges"
-                + (f" beyond {step:.3g} {s.time_unit}" if step else " at every step tried")
-            )
+            bounded = measured.bounded(name)
+            beyond = f"beyond {bounded[0].timestep:.3g} {s.time_unit}" if bounded else ""
+            lines.append(f"{name} diverges {beyond or 'at every step tried'}")
         lines += [
             f"{name}: {failure}" for failure in dict.fromkeys(failures) if failure != "diverges"
         ][:1]
@@ -306,20 +300,24 @@ def cheapest(measured: IntegratorAccuracy) -> list[tuple[str, str, str, str]]:
     `COMMON` it is, others that are as fast. Errors with the same answer are one row."""
     s = measured.trial_system
     rows = []
-    unit = measured.trial_system.time_unit
-    rotates = any(not np.isnan(t.rotation_error) for t in measured.trials)
+    unit = s.time_unit
     # A motion of a body with the right energy is not advised if QᵀQ or another invariant is worse.
     energy = "energy_rms" if s.time_unit == "fs" else "conservation_error"
     kinds = {
         energy: ("an energy error", s.energy_unit),
-        "trajectory_error": ("an error of Q", "") if rotates else ("an error of X", s.length_unit),
+        "trajectory_error": (
+            ("an error of Q", "") if measured.rotates else ("an error of X", s.length_unit)
+        ),
     }
     for error, (what, of) in kinds.items():
         worst = max((getattr(t, error) for t in measured.trials if not t.diverged), default=0.0)
         answers: dict[tuple[str, str, str], list[float]] = {}  # -> the targets that have it
         for target in 10.0 ** np.arange(0, -15, -2):
-            names = dict.fromkeys(t.integrator for t in measured.trials)
-            reached = {name: at for name in names if (at := measured.time_for(name, error, target))}
+            reached = {
+                name: at
+                for name in measured.integrators
+                if (at := measured.time_for(name, error, target))
+            }
             blind = error == "trajectory_error" and target < 3 * measured.reference_error
             if target > worst or len(reached) < 2 or blind:
                 continue
@@ -346,12 +344,11 @@ def cheapest(measured: IntegratorAccuracy) -> list[tuple[str, str, str, str]]:
     return rows
 
 
-def write_accuracy(folder: Path, measured: IntegratorAccuracy, command: str) -> list[Path]:
+def write_accuracy(folder: Path, measured: IntegratorAccuracy, command: str) -> None:
     trial_table(measured).write(folder / FILES[0])
     title = f"{measured.trial_system.name}: error against run time"
     write_figure(folder / FILES[1], lambda: accuracy_figure(measured), title)
     write_page(folder / FILES[2], title, _page_parts(measured, command))
-    return [folder / name for name in FILES if (folder / name).is_file()]
 
 
 def _label_steps(axis, points: list[tuple[float, float, float]], unit: str) -> None:
@@ -383,24 +380,16 @@ def accuracy_figure(measured: IntegratorAccuracy):
     """Log error against log run time, a curve for each integrator. Rings mark the best trials, bars
     the time spread."""
     s = measured.trial_system
-    per = "ps" if s.time_unit == "fs" else "s"
     figure = new_figure(10, 4.8)
     left, right = figure.subplots(1, 2)
-    rotates = any(not np.isnan(t.rotation_error) for t in measured.trials)
+    of = "Q" if measured.rotates else f"X ({s.length_unit})"
     titles = {
-        "trajectory_error": (
-            f"error of {'Q' if rotates else f'X ({s.length_unit})'} after {s.span:g} {per}"
-        ),
+        "trajectory_error": f"error of {of} after {_span(measured)}",
         "energy_rms": f"rms error of the energy, {s.energy_unit}",
     }
-    names = list(dict.fromkeys(t.integrator for t in measured.trials))
     for axis, (error, title) in zip((left, right), titles.items(), strict=True):
-        for k, name in enumerate(names):
-            trials = [
-                t
-                for t in measured.trials
-                if t.integrator == name and not t.diverged and getattr(t, error) > 0
-            ]
+        for k, name in enumerate(measured.integrators):
+            trials = measured.bounded(name, error)
             times = [t.time / s.span for t in trials]
             errors = [getattr(t, error) for t in trials]
             style = curve_style(k)
@@ -428,7 +417,7 @@ def accuracy_figure(measured: IntegratorAccuracy):
         open_axis(axis, which="both")
         label_minor_ticks(axis.xaxis)
         label_minor_ticks(axis.yaxis)
-    figure.supxlabel(f"computing time (s) per {per} of motion", color=INK, fontsize=10)
+    figure.supxlabel(f"computing time (s) per {s.span_unit} of motion", color=INK, fontsize=10)
     left.axhline(measured.reference_error, color=FAINT, lw=0.8, ls=":")
     left.annotate(
         "error of the reference",
@@ -450,7 +439,7 @@ def accuracy_figure(measured: IntegratorAccuracy):
 
 
 def _page_parts(measured: IntegratorAccuracy, command: str) -> Iterator[str]:
-    colored = chips(dict.fromkeys(t.integrator for t in measured.trials))
+    colored = chips(measured.integrators)
     titles = [
         f"error over {_span(measured)}",
         "least run time",

@@ -49,13 +49,23 @@ class IntegratorAccuracy:
     def __repr__(self) -> str:
         return f"<Precision of {self.trial_system.name}: {len(self.trials)} trials>"
 
-    def stable_step(self, integrator: str) -> float | None:
-        steps = [
-            trial.timestep
+    @property
+    def integrators(self) -> list[str]:
+        return list(dict.fromkeys(trial.integrator for trial in self.trials))
+
+    @property
+    def rotates(self) -> bool:
+        return any(not np.isnan(trial.rotation_error) for trial in self.trials)
+
+    def bounded(self, integrator: str, error: str = "timestep") -> list[Trial]:
+        """The trials of an integrator that have not diverged and have an error (an attribute of
+        `Trial`) above 0, with the longest step first."""
+        trials = [
+            trial
             for trial in self.trials
-            if trial.integrator == integrator and not trial.diverged
+            if trial.integrator == integrator and not trial.diverged and getattr(trial, error) > 0
         ]
-        return max(steps, default=None)
+        return sorted(trials, key=lambda trial: -trial.timestep)
 
     def front(self, error: str) -> list[Trial]:
         """Trials that no other beats in both time and error (an attribute of `Trial`), fastest
@@ -70,12 +80,7 @@ class IntegratorAccuracy:
         """Where an integrator reaches an error, between its trials. None if its shortest step is
         not exact enough. At most its longest step, or `STABLE_FRACTION` of it where a longer one
         diverges."""
-        tried = [
-            t
-            for t in self.trials
-            if t.integrator == integrator and not t.diverged and getattr(t, error) > 0
-        ]
-        tried.sort(key=lambda t: -t.timestep)
+        tried = self.bounded(integrator, error)
         if not tried:
             return None
         unstable = any(t.diverged for t in self.trials if t.integrator == integrator)

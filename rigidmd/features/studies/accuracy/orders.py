@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 from rigidmd.core.integrators import RK4, Scheme
 from rigidmd.features.studies.accuracy.measurement import IntegratorAccuracy
-from rigidmd.io.write import Column, Table, format_cell
-from rigidmd.run.trials import Method, Trial
+from rigidmd.io.write import Column, ReportTable, format_cell
+from rigidmd.run.trials import Trial
 
 #: Errors fall where their slopes are at least this fraction of the order.
 FLOOR_FRACTION = 0.5
@@ -50,12 +50,7 @@ class Convergence(NamedTuple):
 def convergence(measured: IntegratorAccuracy, integrator: str, error: str) -> Convergence:
     """The convergence of an error, an attribute of `Trial`."""
     order = measured.trial_system.methods[integrator].order
-    tried = [
-        trial
-        for trial in measured.trials
-        if trial.integrator == integrator and not trial.diverged and getattr(trial, error) > 0
-    ]
-    tried.sort(key=lambda trial: -trial.timestep)
+    tried = measured.bounded(integrator, error)
     points = [(log(trial.timestep), log(getattr(trial, error))) for trial in tried]
     lowest = REFERENCE_MARGIN * measured.reference_error if error in OF_TRAJECTORY else 0.0
     end = len(tried)
@@ -102,58 +97,49 @@ OF_TRAJECTORY = ("trajectory_error", "rotation_error", "position_error")
 ENERGY = "energy_rms"
 
 
-def order_table(measured: IntegratorAccuracy) -> Table:
+def order_table(measured: IntegratorAccuracy) -> ReportTable:
     """A row for each integrator: its order, the measured ones, its longest stable step."""
     system = measured.trial_system
     rotates = any(trial.rotation_error > 0 for trial in measured.trials)
-    of, name = ("Q", "rotation_error") if rotates else ("X", "position_error")
-    integrators = list(dict.fromkeys(trial.integrator for trial in measured.trials))
+    of, error = ("Q", "rotation_error") if rotates else ("X", "position_error")
+
+    def order(integrator: str) -> str | None:
+        """The order of a scheme. A solver that chooses its steps has none."""
+        method = system.methods[integrator]
+        adapts = not isinstance(method.scheme, Scheme) and method.scheme.name != RK4
+        return None if adapts else str(method.order)
 
     def measured_order(error: str):
-        return lambda name: _shown(convergence(measured, name, error).order)
+        def text(integrator: str) -> str | None:
+            order = convergence(measured, integrator, error).order
+            return None if order is None else str(order)
 
-    return Table(
+        return text
+
+    def stable_step(integrator: str) -> float | None:
+        return next((trial.timestep for trial in measured.bounded(integrator)), None)
+
+    return ReportTable(
         [
             Column("integrator", str),
-            Column("order", lambda each: _order_of(system.methods[each])),
+            Column("order", order),
             Column("measured, energy", measured_order(ENERGY)),
-            Column(f"measured, {of}", measured_order(name)),
-            Column(f"longest stable step ({system.time_unit})", measured.stable_step),
+            Column(f"measured, {of}", measured_order(error)),
+            Column(f"longest stable step ({system.time_unit})", stable_step),
         ],
-        integrators,
+        measured.integrators,
     )
 
 
-def _order_of(method: Method) -> str | None:
-    """The order of a scheme. A solver that chooses its steps has none."""
-    adapts = not isinstance(method.scheme, Scheme) and method.scheme.name != RK4
-    return None if adapts else str(method.order)
-
-
-def _shown(order: Order | None) -> str | None:
-    return None if order is None else str(order)
-
-
-def with_marks(measured: IntegratorAccuracy, table: Table) -> Table:
-    """The table of trials with a mark at errors that are at their floor."""
-    marked = {"energy rms": ENERGY, "error of Q": "rotation_error", "error of X": "position_error"}
-    columns = []
-    for column in table.columns:
-        error = next((value for key, value in marked.items() if column.header.startswith(key)), "")
-        columns.append(column._replace(value=_marked(measured, column, error)) if error else column)
-    return Table(columns, table.rows)
-
-
-def _marked(measured: IntegratorAccuracy, column: Column, error: str):
-    """The value of a column as text, with a mark where it is at its floor."""
-    integrators = dict.fromkeys(trial.integrator for trial in measured.trials)
-    floors = [trial for name in integrators for trial in convergence(measured, name, error).floor]
+def with_marks(measured: IntegratorAccuracy, error: str, column: Column[Trial]) -> Column[Trial]:
+    """A column of an error as text, with a mark where the error is at its floor."""
+    floors = [
+        trial for name in measured.integrators for trial in convergence(measured, name, error).floor
+    ]
 
     def value(trial: Trial) -> str | None:
         number = column.value(trial)
-        if number is None:
-            return None
         at_floor = any(trial is other for other in floors)
-        return format_cell(number) + (FLOOR_MARK if at_floor else " ")
+        return None if number is None else format_cell(number) + (FLOOR_MARK if at_floor else " ")
 
-    return value
+    return column._replace(value=value)

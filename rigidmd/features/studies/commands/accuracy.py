@@ -1,6 +1,8 @@
 """`rigidmd accuracy`."""
 
+import shlex
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rigidmd.commands.arguments import (
     SCENE,
@@ -12,6 +14,10 @@ from rigidmd.commands.arguments import (
     read_scene,
     write_study,
 )
+from rigidmd.commands.streams import progress_bar
+
+if TYPE_CHECKING:
+    from rigidmd.scene import Scene
 
 
 @command(
@@ -74,8 +80,7 @@ from rigidmd.commands.arguments import (
 )
 def _accuracy(options: Options) -> int:
     from rigidmd.errors import SceneError
-    from rigidmd.features.studies.accuracy import accuracy, averages_report
-    from rigidmd.features.studies.accuracy.averages import SAMPLE_PS, measure_averages
+    from rigidmd.features.studies.accuracy import accuracy
 
     scene = read_scene(options)
     folder = Path(options.output) if options.output else Path("runs") / f"{scene.name}-accuracy"
@@ -89,23 +94,7 @@ def _accuracy(options: Options) -> int:
             "--timesteps", [f"{options.timesteps!r} is not a list of numbers such as 1,2,4"]
         ) from None
     if options.averages:
-        sample = SAMPLE_PS if options.sample_ps is None else options.sample_ps
-        write_study(
-            folder,
-            force=options.force,
-            files=averages_report.FILES,
-            begins="compiling, and running what comes before the last stage",
-            measure=lambda progress: measure_averages(
-                scene, integrators, timesteps, sample, progress
-            ),
-            describe=lambda biases: [
-                averages_report.table_text(biases),
-                "",
-                *averages_report.bias_conclusions(biases),
-            ],
-            write=averages_report.write_averages,
-        )
-        return 0
+        return _sweep_of_averages(options, scene, folder, integrators, timesteps)
     if options.sample_ps is not None:
         raise SceneError("--sample-ps", ["it needs --averages"])
     settings = integrators, timesteps, options.span, options.repeats
@@ -119,3 +108,30 @@ def _accuracy(options: Options) -> int:
         write=accuracy.write_accuracy,
     )
     return 0
+
+
+def _sweep_of_averages(
+    options: Options,
+    scene: "Scene",
+    folder: Path,
+    methods: list[str] | None,
+    timesteps: list[float] | None,
+) -> int:
+    from rigidmd.features.studies.accuracy.averages import SAMPLE_PS, plan_averages
+    from rigidmd.features.studies.commands import sweep
+    from rigidmd.features.studies.sweep.sweeping import open_sweep
+    from rigidmd.scene import parse_override
+
+    sample = SAMPLE_PS if options.sample_ps is None else options.sample_ps
+    overrides = dict(map(parse_override, options.overrides))
+    with progress_bar("compiling, and running what comes before the last stage") as progress:
+        plan = plan_averages(scene, overrides, methods, timesteps, sample, progress)
+    more = {"trust": options.trust, "force": options.force, "step": plan.step_key}
+    path = Path(options.scene)
+    with open_sweep(path, plan.axes, folder, includes=plan.includes, **more) as manifest:
+        print(f"--averages is a sweep over {', '.join(manifest.keys)}. To read it again:")
+        words = ["rigidmd", "sweep", options.scene, "-o", str(folder), "--collect"]
+        print(f"  {shlex.join([*words, '--extrapolate', plan.step_key])}")
+        defaults = dict.fromkeys(("jobs", "threads", "scheduler", "walltime"))
+        settings = vars(options) | defaults | {"extrapolate": plan.step_key}
+        return sweep.run(Options(**settings), manifest)

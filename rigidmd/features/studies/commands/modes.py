@@ -69,12 +69,10 @@ def _modes(options: Options) -> int:
     begin = perf_counter()
     names = (FILE, *(animation_files(scene) if options.animate else []))
 
-    def write(folder: Path, modes: "NormalModes", command: str) -> list[Path]:
+    def write(folder: Path, modes: "NormalModes", command: str) -> None:
         modes.table().write(folder / FILE)
-        if not options.animate or not modes.is_vibration(options.animate):
-            return [folder / FILE]
-        write_animation(folder, modes, options.animate)
-        return [folder / name for name in names]
+        if options.animate and modes.is_vibration(options.animate):
+            write_animation(folder, modes, options.animate)
 
     def compute(progress: Callable[[float], object]) -> "NormalModes":
         return normal_modes(

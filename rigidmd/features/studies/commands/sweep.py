@@ -123,7 +123,7 @@ def _sweep(options: Options) -> int:
         if options.to is not None:
             _write_commands(options, manifest)
             return 0
-        return _run(options, manifest)
+        return run(options, manifest)
 
 
 def _check(options: Options) -> None:
@@ -158,7 +158,7 @@ def _write_commands(options: Options, manifest: "Manifest") -> None:
     print(f"  when all have ended: {shlex.join(words)}")
 
 
-def _run(options: Options, manifest: "Manifest") -> int:
+def run(options: Options, manifest: "Manifest") -> int:
     from concurrent.futures import ThreadPoolExecutor
 
     from rigidmd.features.studies.sweep.points import cluster, run_points

@@ -144,10 +144,9 @@ def _limit_cells(results: Results, unit: str) -> tuple[str, str]:
     return f"{step} {unit}", least.beyond or "-"
 
 
-def write_stability(folder: Path, results: Results, command: str) -> list[Path]:
+def write_stability(folder: Path, results: Results, command: str) -> None:
     write_csv(folder / FILES[0], [COLUMNS.split(","), *map(_csv_row, results)])
     write_page(folder / FILES[1], "Stability", _page_parts(results, command))
-    return [folder / name for name in FILES]
 
 
 def _csv_row(result: TrialResult) -> list[object]:

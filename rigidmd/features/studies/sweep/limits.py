@@ -10,7 +10,8 @@ import numpy as np
 
 from rigidmd.core.statistics import format_signed
 from rigidmd.core.toml import Json
-from rigidmd.engines.samples import COLUMNS
+from rigidmd.engines.samples import COLUMNS, IN_LOGS
+from rigidmd.engines.system import System
 from rigidmd.errors import RigidMDError, SceneError
 from rigidmd.features.analysis.files import read_table
 from rigidmd.features.studies.extrapolation import (
@@ -20,26 +21,35 @@ from rigidmd.features.studies.extrapolation import (
     extrapolate,
     means_of_runs,
 )
-from rigidmd.features.studies.joint_fit import RunResults, fit_jointly, results_of_run
+from rigidmd.features.studies.joint_fit import (
+    GAS_CONSTANT,
+    RunResults,
+    fit_jointly,
+    results_of_run,
+)
 from rigidmd.features.studies.sweep.figure import draw_table
 from rigidmd.features.studies.sweep.folder import Manifest, describe_values, point_name, short_keys
 from rigidmd.features.studies.sweep.table import (
+    DENSITY,
     DRIFT,
     MAIN,
+    POTENTIAL,
+    PRESSURE,
     SHORT,
     Measured,
     SweepRow,
+    Table,
     key_cells,
     report_of,
     table_of,
 )
-from rigidmd.features.studies.sweep.table import Table as SweepTable
 from rigidmd.features.view.figures.style import curve_style, write_figure
 from rigidmd.features.view.page import code, items, plain, section, table, wide, write_page
-from rigidmd.io.folder import SCENE, add_to_folder
-from rigidmd.io.write import Cell, Table, nine_digits
+from rigidmd.io.folder import add_to_folder
+from rigidmd.io.write import Cell, ReportTable, nine_digits
 from rigidmd.run.record import read_record
 from rigidmd.scene import Scene, is_molecular
+from rigidmd.units import BAR, BOLTZMANN
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,18 +63,40 @@ RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 INDEPENDENT, JOINT, FLUCTUATIONS = "independent", "joint", "fluctuations"
 #: Relative rounding error of a mean of equal numbers.
 ROUNDING = 1e-12
+TEMPERATURES = [
+    IN_LOGS[f"temperature{motion}"].header for motion in ("", "_translation", "_rotation")
+]
+OF_LOG = {POTENTIAL, *(column.header for column in IN_LOGS.values())}
+#: Keys of a stage that change no average at a step of 0.
+OF_METHODS = ("integrator", "thermostat")
+#: The step at which a bias reaches this fraction of the scale of its quantity is reported.
+BIAS_LIMIT = 0.01
+#: A slope of at most this many standard errors counts as not seen.
+UNSEEN = 2.0
 
 
 class Limit(NamedTuple):
     """A quantity at zero time step, for a combination of values of the keys other than the step and
-    the seed."""
+    the seed. Averages of the log by several methods have one fit.
+
+    scale : of which `BIAS_LIMIT` is reached at a step. None: no step is reported
+    """
 
     values: Json
-    method: str  # integrator
+    integrator: str
     quantity: str  # with its unit
     points: list[MeanAtStep]
     fit: BiasFit
     kind: str = INDEPENDENT
+    scale: float | None = None
+
+    @property
+    def method(self) -> str:
+        return self.points[0].method
+
+    @property
+    def order(self) -> int:
+        return self.points[0].order
 
     def bias(self, step: float) -> tuple[float, float] | None:
         """Mean at a step less limit, with its error. That of a joint fit by its slope. None without
@@ -73,6 +105,19 @@ class Limit(NamedTuple):
             slope, error = self.fit.slopes[""]
             return slope * step**2, error * step**2
         return next((self.fit.bias(at) for at in self.points if at.timestep == step), None)
+
+    @property
+    def step_at_limit(self) -> str | None:
+        """The step (fs) at which the bias reaches `BIAS_LIMIT`. A bias whose slope is not seen is
+        smaller up to the step after ">"."""
+        slope, error = self.fit.slopes.get(self.method, (0.0, 0.0))
+        seen = abs(slope) > UNSEEN * error
+        steepest = abs(slope) + (0.0 if seen else UNSEEN * error)
+        if self.scale is None or steepest == 0:
+            return None
+        return (
+            f"{'' if seen else '> '}{(BIAS_LIMIT * self.scale / steepest) ** (1 / self.order):.2g}"
+        )
 
     @property
     def title(self) -> str:
@@ -100,11 +145,11 @@ class Limits(NamedTuple):
 
     @property
     def title(self) -> str:
-        orders = [(str(limit.fit.order).translate(RAISED), limit.method) for limit in self.limits]
-        powers = dict.fromkeys(f"dt{order} ({method})" for order, method in orders)
+        orders = [(str(limit.order).translate(RAISED), limit.integrator) for limit in self.limits]
+        powers = dict.fromkeys(f"dt{order} ({integrator})" for order, integrator in orders)
         return f"averages at a step of 0, from errors of order {', '.join(powers)} in {self.key}"
 
-    def as_text(self) -> Table:
+    def as_text(self) -> ReportTable:
         """For readers: limits, chi² over its degrees of freedom, the longest step of the fit, and
         biases."""
         short = short_keys(self.keys)
@@ -118,6 +163,7 @@ class Limits(NamedTuple):
             line["limit"] = fit.describe_limit()
             line["chi²/dof"] = f"{fit.chi2:.2g}/{fit.freedom}" if fit.freedom else None
             line["to (fs)"] = f"{fit.longest:g}"
+            line["off by 1% at (fs)"] = limit.step_at_limit
             for step in self.steps:
                 bias = limit.bias(step)
                 line[f"bias at {step:g} fs"] = None if bias is None else format_signed(*bias)
@@ -132,8 +178,8 @@ class Limits(NamedTuple):
             line = key_cells(limit.values)
             line["average"] = limit.quantity
             line["fit"] = limit.kind
-            line["integrator"] = limit.method
-            line["order"] = fit.order
+            line["integrator"] = limit.integrator
+            line["order"] = limit.order
             line["limit"] = nine_digits(fit.limit)
             line["limit error"] = nine_digits(fit.limit_error)
             line["chi2"] = nine_digits(fit.chi2) if fit.freedom else None
@@ -179,9 +225,26 @@ class _Average:
     quantity: str
     integrator: str
     order: int
+    method: str  # the values of `OF_METHODS`, for averages of the log
+    scale: float | None
     #: Step (fs) -> value and error of each run; -> value of the runs together.
     runs: dict[float, list[Measured]] = field(default_factory=dict)
     together: dict[float, Together] = field(default_factory=dict)
+
+    @property
+    def ensemble(self) -> tuple[str, str]:
+        """What averages by several methods have in common."""
+        values = {
+            key: value
+            for key, value in self.values.items()
+            if not (self.method and key.endswith(OF_METHODS))
+        }
+        return str(values), self.quantity
+
+    @property
+    def points(self) -> list[MeanAtStep]:
+        points = means_of_runs(self.runs, self.together)
+        return [point._replace(method=self.method, order=self.order) for point in points]
 
     @property
     def is_constant(self) -> bool:
@@ -194,23 +257,28 @@ class _Average:
 def extrapolate_sweep(manifest: Manifest, key: str) -> Limits:
     """Extrapolate all log averages in a sweep, and the values of its analyses, to a step of 0.
 
-    Values of analyses come from replicas together, if they have been analysed together, else from
-    single runs. Raises SceneError if the key is not a swept time step, OutputError.
+    Averages of the log by several integrators and thermostats have one limit. Values of analyses
+    come from replicas together, if they have been analysed together, else from single runs. Raises
+    SceneError if the key is not a swept time step, OutputError.
     """
     limits, missing = [], []
+    ensembles: dict[tuple[str, str], list[tuple[_Average, list[MeanAtStep]]]] = {}
     for average in _averages(manifest, key):
         if average.quantity == DRIFT or average.is_constant:
             continue
         title = describe_values(average.values, short_keys(manifest.keys))
         name = f"{title}: {average.quantity}" if title else average.quantity
-        points = means_of_runs(average.runs, average.together)
         if len(average.runs) < 2:
             missing.append(f"{name}: has values at one step only")
-        elif points:
-            fit = extrapolate(points, order=average.order)
-            limits.append(Limit(average.values, average.integrator, average.quantity, points, fit))
+        elif points := average.points:
+            ensembles.setdefault(average.ensemble, []).append((average, points))
         else:
             missing.append(f"{name}: the runs are too short and too few for an error")
+    for averages in ensembles.values():
+        fit = extrapolate([point for _, points in averages for point in points])
+        for of, points in averages:
+            about = of.values, of.integrator, of.quantity
+            limits.append(Limit(*about, points, fit, INDEPENDENT, of.scale))
     joint, not_joint = _joint_limits(manifest, key)
     return Limits(manifest.name, key, limits + joint, missing, not_joint)
 
@@ -268,22 +336,48 @@ def _averages(manifest: Manifest, key: str) -> Iterator[_Average]:
         if not row.runs:
             continue
         point = next(point for point in points if point.state == "finished")
-        scene = Scene.read(manifest.folder / point.folder / SCENE)
-        first, k = step_key(manifest, key, scene)
-        stage = scene.stages[k]  # pyright: ignore[reportAttributeAccessIssue]  (it has stages)
+        record = read_record(manifest.folder / point.folder)
+        first, k = step_key(manifest, key, record.scene)
+        stage = record.scene.stages[k]  # pyright: ignore[reportAttributeAccessIssue]  (it has stages)
         step = float(row.values[first])
         others = {name: value for name, value in row.values.items() if name != first}
+        of_method = {name: value for name, value in others.items() if name.endswith(OF_METHODS)}
+        method = describe_values(of_method, short)
+        scales = _scales(record.system, k) | {DENSITY: row[DENSITY][0]}
         together = {}
         if len(points) > 1:
             together = _values_together(manifest.folder / point_name(row.values, short))
         measured = {column: None for run in row.runs.values() for column in run}
         for column in measured | together:
-            average = _Average(others, column, stage.integrator, stage.scheme.order)
+            average = _Average(
+                others,
+                column,
+                stage.integrator,
+                stage.scheme.order,
+                method if column in OF_LOG else "",
+                scales.get(column),
+            )
             average = averages.setdefault((describe_values(others, short), column), average)
             average.runs[step] = [run[column] for run in row.runs.values() if column in run]
             if column in together:
                 average.together[step] = together[column]
     yield from averages.values()
+
+
+def _scales(system: System, k: int) -> dict[str, float]:
+    """Sizes of averages in stage k, of which biases are fractions: kT per degree of freedom for
+    U, the set temperature, and N kT/V for the pressure. Empty without a thermostat."""
+    stage = system.scene.stages[k]
+    if not stage.has_thermostat:
+        return {}
+    temperature = stage.temperatures[0]
+    count = len(system.model.species)
+    per_molecule = system.freedom_in(k).total / count
+    scales = dict.fromkeys(TEMPERATURES, temperature)
+    scales[POTENTIAL] = GAS_CONSTANT * temperature * per_molecule
+    if system.space.volume < np.inf:
+        scales[PRESSURE] = count * BOLTZMANN * temperature / system.space.volume / BAR
+    return scales
 
 
 def _values_together(folder: Path) -> dict[str, Together]:
@@ -336,17 +430,18 @@ def _figure(limits: Limits):
             row = SweepRow({limits.key: point.timestep} | limit.values, {None: {}})
             row = rows.setdefault((limit.label, point.timestep), row)
             row.runs[None][limit.quantity] = point.mean, point.error
-    means = SweepTable(Path(), [limits.key, *limits.keys], list(rows.values()), shown)
+    means = Table(Path(), [limits.key, *limits.keys], list(rows.values()), shown)
     figure = draw_table(means, shown, connected=False)
     labels = list(dict.fromkeys(limit.label for limit in independent))
     for limit in independent:
         if limit.quantity in shown:
             axis = figure.axes[shown.index(limit.quantity)]
-            _draw_limit(axis, limit.fit, labels.index(limit.label))
+            _draw_limit(axis, limit, labels.index(limit.label))
     return figure
 
 
-def _draw_limit(axis: "Axes", fit: BiasFit, k: int) -> None:
+def _draw_limit(axis: "Axes", limit: Limit, k: int) -> None:
+    fit = limit.fit
     style = curve_style(k, connected=False)
     axis.errorbar(
         [0],
@@ -359,6 +454,6 @@ def _draw_limit(axis: "Axes", fit: BiasFit, k: int) -> None:
         **style,
     )
     step = np.linspace(0, fit.longest, 60)
-    slope = fit.slopes[""][0] if fit.slopes else 0.0
-    axis.plot(step, fit.limit + slope * step**fit.order, color=style["color"], lw=0.9)
+    slope, _ = fit.slopes.get(limit.method, (0.0, 0.0))
+    axis.plot(step, fit.limit + slope * step**limit.order, color=style["color"], lw=0.9)
     axis.set_xlim(left=0)

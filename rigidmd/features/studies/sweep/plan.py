@@ -205,13 +205,21 @@ def _check_axes(axes: Sequence[Axis]) -> None:
         raise SceneError(option("sets"), errors)
 
 
-def read_points(path: Path, axes: Sequence[Axis], trusted: Sequence[str] = ()) -> Manifest:
-    """The checked points of a sweep. Raises SceneError with all errors of all points."""
+def read_points(
+    path: Path,
+    axes: Sequence[Axis],
+    trusted: Sequence[str] = (),
+    includes: Callable[[Json], bool] = lambda values: True,
+) -> Manifest:
+    """The checked points of a sweep. Raises SceneError with all errors of all points.
+
+    includes : whether the point with these values is one of the sweep
+    """
     _check_axes(axes)
     keys = {axis.keys[0]: list(axis.keys) for axis in axes if axis.swept}
     fixed = {key: axis.values[0] for axis in axes if not axis.swept for key in axis.keys}
     manifest = Manifest("", str(path.absolute()), keys, fixed, {}, {})
-    short, all_values = short_keys(keys), settings(axes)
+    short, all_values = short_keys(keys), [*filter(includes, settings(axes))]
     digest = cache(file_digest)  # each file is read once
     points_of: dict[str, list[str]] = defaultdict(list)  # error -> descriptions of its points
     build_errors: dict[str, RigidMDError | None] = {}  # values without the seed -> error

@@ -1,7 +1,7 @@
 """`rigidmd sweep`: its folder is opened, its points run here, or commands for them are written."""
 
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +10,7 @@ from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.core.files import write_text, writing
 from rigidmd.core.plain_text import UNSAFE, as_word, in_comment
 from rigidmd.core.process import OUT_OF_TIME
+from rigidmd.core.toml import Json
 from rigidmd.errors import OutputError, SimulationError
 from rigidmd.features import provider
 from rigidmd.features.studies.sweep.figure import collect
@@ -73,6 +74,7 @@ def open_sweep(
     trust: Sequence[str] = (),
     force: bool = False,
     step: str | None = None,
+    includes: Callable[[Json], bool] = lambda values: True,
 ) -> Iterator[Manifest]:
     """Check all points of a scene file, compare them with the folder, and write the manifest. No
     other sweep can run in the folder within the block.
@@ -80,7 +82,7 @@ def open_sweep(
     folder : default: runs/NAME-sweep
     replicas : number of seeds, from the seed of the scene on
     trust : Python files that the scene may run; force : remove the sweep in the folder
-    step : a key that has to be a time step that varies
+    step : a key that has to be a time step that varies; includes : see `read_points`
 
     Raises SceneError, OutputError.
     """
@@ -97,7 +99,8 @@ def open_sweep(
         raise OutputError(f"{folder} is a file; {elsewhere()}")
     if not is_empty(folder) and not is_sweep(folder):
         raise OutputError(f"{folder} is not empty and holds no sweep; {elsewhere()}")
-    manifest = read_points(scene, axes if force else order_axes(folder, axes), trust)
+    axes = axes if force else order_axes(folder, axes)
+    manifest = read_points(scene, axes, trust, includes)
     if step is not None:
         step_key(manifest, step, Scene.read(scene, manifest.overrides(manifest.points[0].values)))
     with FolderLock(folder) as lock:

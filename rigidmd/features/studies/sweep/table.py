@@ -27,8 +27,7 @@ from rigidmd.features.studies.sweep.folder import (
     short_keys,
     value_name,
 )
-from rigidmd.io.write import Cell, Column, nine_digits
-from rigidmd.io.write import Table as ReportTable
+from rigidmd.io.write import Cell, Column, ReportTable, nine_digits
 from rigidmd.run.record import Record, read_record
 
 if TYPE_CHECKING:

@@ -19,7 +19,6 @@ from rigidmd.features.studies.accuracy import accuracy
 from rigidmd.features.studies.accuracy.accuracy import (
     measure_accuracy,
     recommendations,
-    table_text,
     trial_table,
     write_accuracy,
 )
@@ -85,7 +84,7 @@ def test_a_spread_is_shown_and_warned_of_and_none_is_claimed_of_one_timing(tmp_p
     found, words = told((1.0,), (1.5,))
     assert "timed once" in words
     assert "warning" not in words
-    assert "±" not in table_text(found).splitlines()[1].replace("drift        ±", "drift")
+    assert "±" not in trial_table(found).text().splitlines()[0].replace("drift        ±", "drift")
     write_accuracy(tmp_path, found, "a command")
     with (tmp_path / "accuracy.csv").open() as file:
         assert [line["spread (%)"] for line in csv.DictReader(file)] == ["", ""]
@@ -110,7 +109,7 @@ def test_the_front_and_the_advice_follow_from_the_numbers(top):
     )
     assert "times faster than velocity_verlet" in said
     assert "timing noise" not in said
-    assert table_text(top).count("srkn_4") == len(trials(top, "srkn_4")) > 6
+    assert trial_table(top).text().count("srkn_4") == len(trials(top, "srkn_4")) > 6
 
 
 def test_advice_comes_first_names_its_span_and_is_one_line_for_all_errors_that_a_longest_step_keeps():
@@ -383,7 +382,7 @@ def test_what_else_is_kept_is_shown(top):
     verlet = trials(top, "velocity_verlet")[0]
     assert set(verlet.conserved_errors) == {"L_z", "L_3"}
     assert max(verlet.conserved_errors.values()) < 1e-12
-    assert "L_z" in table_text(top).splitlines()[1]
+    assert "L_z" in trial_table(top).text().splitlines()[0]
     dimer = measure_accuracy(
         Scene.read(ROOT / "systems" / "water_dimer.toml", {"precision": "double"}),
         ["velocity_verlet"],

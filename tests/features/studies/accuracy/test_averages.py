@@ -1,19 +1,21 @@
-"""Averages at finite steps: biases of oscillators and of water, errors, what needs a thermostat."""
+"""Averages at finite steps: the sweep that measures their biases, what needs a thermostat."""
 
 import csv
 import json
+import shlex
 
 import numpy as np
 import pytest
 from support.accuracy import TOP, trials
-from support.common import ROOT, SPRING, small_scene, springs
+from support.common import ROOT, SPRING, springs
 
 from rigidmd.commands.cli import main
 from rigidmd.core.statistics import mean_and_error
 from rigidmd.errors import SceneError
-from rigidmd.features.studies.accuracy import averages, averages_report
+from rigidmd.features.studies.accuracy import averages
 from rigidmd.features.studies.accuracy.accuracy import measure_accuracy
-from rigidmd.features.studies.accuracy.averages import measure_averages
+from rigidmd.features.studies.accuracy.averages import plan_averages
+from rigidmd.features.studies.extrapolation import MeanAtStep, extrapolate
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
@@ -53,136 +55,105 @@ def test_the_step_takes_from_the_kinetic_energy_at_its_ends(water):
     assert at_constant_energy(water, "srkn_4", 4.0, 0.1)[1] == pytest.approx(0, abs=1e-6)
 
 
-@pytest.fixture(scope="module")
-def oscillators():
-    """Springs at w dt = 1 and less, by velocity Verlet and BAOAB."""
+@pytest.mark.soak
+def test_averages_of_oscillators_are_off_by_what_theory_states():
+    """Springs at w dt = 1 and less. Velocity Verlet conserves p²/2m + m w² (1 - x/4) q²/2 with x =
+    (w dt)², which gives its U."""
     unit = 1e3 * np.sqrt(39.948 / SPRING)  # fs of a radian
-    fractions = []
-    found = measure_averages(
-        springs(),
-        ["velocity_verlet", "baoab"],
-        [0.4 * unit, 0.7 * unit, unit],
-        sample=60.0,
-        progress=fractions.append,
-    )
-    assert fractions == sorted(fractions)
-    assert fractions[-1] == pytest.approx(1)
-    return found
-
-
-@pytest.mark.soak
-def test_averages_of_oscillators_are_off_by_what_theory_states(oscillators):
-    thermal, freedom = 0.0083144626 * 300, 3
-    quantities = {quantity.name: quantity for quantity in oscillators.quantities}
-    for run in oscillators.runs:
-        x = (run.timestep / 1e3) ** 2 * SPRING / 39.948
-        verlet = run.integrator == "velocity_verlet"
-        swing = 1 / (1 - x / 4)  # of the conserved energy p²/2m + m w² (1 - x/4) q²/2
-        exact = {
-            "U": freedom * thermal / 2 * (swing if verlet else 1),
-            "T_trans": 300,  # where the thermostat acts
-        }
-        for name, value in exact.items():
-            mean, error = run.averages[name]
-            assert error < 0.01 * value
-            assert abs(mean - value) < 4 * error
-            assert oscillators.point(run, quantities[name]).mean == mean
-
-
-@pytest.mark.soak
-def test_what_is_reported_of_averages_follows_from_them(oscillators):
-    quantities = {quantity.name: quantity for quantity in oscillators.quantities}
-    assert {quantity.name for quantity in oscillators.main} == {"U", "T_trans", "pressure"}
-    assert "Kinetic Energy (kJ/mole)" in quantities
-    potential = quantities["U"]
-    limit = oscillators.fit(potential)
-    assert abs(limit.limit - 1.5 * 0.0083144626 * 300) < 4 * limit.limit_error
-    coarse = oscillators.runs[2]
-    bias, error = oscillators.bias(coarse, potential)
-    assert coarse.method == "velocity_verlet + langevin"
-    assert abs(bias - (1 / 0.75 - 1) / 2) < 4 * error < 0.1
+    thermal = 1.5 * 0.0083144626 * 300
+    means = []
+    for integrator in ("velocity_verlet", "baoab"):
+        for x in (0.16, 0.49, 1.0):
+            step = unit * np.sqrt(x)
+            scene = springs(integrator=integrator, timestep_fs=step, duration_ps=72.0)
+            output = scene.output.model_copy(update={"log_interval_ps": 0.02})
+            results = Simulation(scene.model_copy(update={"output": output})).run()
+            late = results["time"] > 12
+            swing = 1 / (1 - x / 4) if integrator == "velocity_verlet" else 1
+            for series, exact in (
+                (results["potential"] / 64, thermal * swing),
+                (results["temperature_translation"], 300),  # where the thermostat acts
+            ):
+                mean, error = mean_and_error(series[late])
+                assert error < 0.01 * exact
+                assert abs(mean - exact) < 4 * error
+                if exact != 300:
+                    means.append(MeanAtStep(integrator, step, mean, error))
+    fit = extrapolate([point for point in means if point.timestep < 0.9 * unit])
+    assert abs(fit.limit - thermal) < 4 * fit.limit_error
     # 1 % of kT is x/8
-    step, seen = oscillators.step_at_limit("velocity_verlet + langevin", potential)
-    assert seen
-    assert step == pytest.approx(1e3 * np.sqrt(0.08 * 39.948 / SPRING), rel=0.1)
-    assert not oscillators.step_at_limit("velocity_verlet + langevin", quantities["T_trans"])[1]
-    said = "\n".join(averages_report.bias_conclusions(oscillators))
-    assert (
-        f"U is off by 1% of kT per degree of freedom at: velocity_verlet + langevin {step:.2g} fs; baoab"
-        in said
-    )
-    assert (
-        "T_trans is off by 1% of its value at: velocity_verlet + langevin none seen, more than"
-        in said
-    )
-    assert "temperatures are compared with 300 K" in said
-    assert coarse.forces_per_ps == pytest.approx(1e3 / coarse.timestep)
-    assert coarse.seconds_per_ns > 0
+    step = np.sqrt(0.01 * thermal / 1.5 / fit.slopes["velocity_verlet"][0])
+    assert step == pytest.approx(unit * np.sqrt(0.08), rel=0.15)
+    assert abs(fit.slopes["baoab"][0]) < 4 * fit.slopes["baoab"][1]
 
 
-def test_averages_leave_out_what_comes_before_equilibrium():
-    """A fifth of the time sampled comes before it: the means are the values of the same run without its
-    first part."""
-    (run,) = measure_averages(springs(), ["baoab"], [10.0], sample=2.0).runs
-    again = springs(integrator="baoab", timestep_fs=10.0, duration_ps=2.4)
-    looked = again.output.model_copy(update={"log_interval_ps": 0.02})
-    results = Simulation(again.model_copy(update={"output": looked})).run()
-    late = results["time"] > 0.4
-    assert (late.sum(), len(late)) == (100, 121)
-    for name, column, share in (("U", "potential", 64), ("T_trans", "temperature_translation", 1)):
-        assert run.averages[name][0] == pytest.approx(
-            results[column][late].mean() / share, rel=1e-9
-        )
+GAS = """
+seed = 7
+
+[box]
+lengths_A = 20.0
+
+[[molecules]]
+model = "argon"
+count = 20
+
+[forces]
+cutoff_A = 8.0
+
+[start]
+temperature_K = 90.0
+
+[[stages]]
+name = "sampling"
+ensemble = "nvt"
+temperature_K = 90.0
+duration_ps = 1
+timestep_fs = 5
+thermostat = "langevin"
+friction_translation_per_ps = 5.0
+"""
 
 
-def test_averages_are_written_and_what_fails_is_reported(tmp_path, capsys, monkeypatch):
-    stage = {
-        "ensemble": "npt",
-        "temperature_K": 90.0,
-        "pressure_bar": 1.0,
-        "duration_ps": 1.0,
-        "timestep_fs": 5.0,
-    }
-    scene = small_scene(
-        {"argon": 40}, 18.5, start={"temperature_K": 90.0}, stages=[{"duration_ps": 0.1}, stage]
-    )
-    monkeypatch.setattr(Scene, "read", lambda path, overrides: scene)
-    folder = tmp_path / "p"
-    command = [
-        "accuracy",
-        "liquid.toml",
-        "--averages",
-        "--sample-ps",
-        "20",
-        "--timesteps",
-        "5,10,400",
-        "--integrators",
-        "velocity_verlet",
-        "-o",
-        str(folder),
+@pytest.fixture(scope="module")
+def gas(tmp_path_factory):
+    path = tmp_path_factory.mktemp("gas") / "gas.toml"
+    path.write_text(GAS)
+    return path
+
+
+METHODS = "velocity_verlet,baoab+velocity_rescaling"
+SWEPT = ("stages.0.integrator", "stages.0.thermostat", "stages.0.timestep_fs")
+
+
+def test_averages_are_a_sweep_over_methods_and_steps(gas, tmp_path, printed):
+    """Its points are two of the four pairs of integrator and thermostat, at each step. The command
+    that it prints reads it again, with the same table."""
+    folder = tmp_path / "averages"
+    command = ["accuracy", gas, "--averages", "--sample-ps", "10", "--integrators", METHODS]
+    said = printed(*command, "--timesteps", "5,10,20", "-o", folder).out
+    assert f"--averages is a sweep over {', '.join(SWEPT)}" in said
+    manifest = json.loads((folder / "sweep.json").read_text())
+    points = [tuple(point["values"].values()) for point in manifest["points"]]
+    assert points == [
+        (*method, step)
+        for method in (("velocity_verlet", "langevin"), ("baoab", "velocity_rescaling"))
+        for step in (5.0, 10.0, 20.0)
     ]
-    assert main(command) == 0
-    said = capsys.readouterr().out
-    assert "bias of averages over 20 ps of npt" in said
-    assert "velocity_verlet + velocity_rescaling at 400 fs: stopped at step" in said
-    with (folder / "accuracy.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert [row["step (fs)"] for row in rows] == ["5.0", "10.0", "400.0"]
-    assert float(rows[0]["density (g/cm³)"]) > 0
-    assert rows[2]["density (g/cm³)"] == ""
-    told = json.loads((folder / "accuracy.json").read_text())
-    assert told["runs"][0]["averages"]["density"]["mean"] == float(rows[0]["density (g/cm³)"])
-    assert told["runs"][2]["failure"].startswith("stopped at step")
-    assert "pressure" not in told["quantities"]
-    assert told["quantities"]["density"]["degrees_of_freedom"] == 0  # one method at two steps
-    assert told["runs"][0]["averages"]["Temperature (K)"]["mean"] > 0
-    assert (folder / "averages.png").read_bytes().startswith(b"\x89PNG")
-    page = (folder / "averages.html").read_text("utf-8")
-    assert page.count("<tr>") == 2 + 1 + 3  # heads, a method, runs
-    assert "density" in page
-    assert "at 400 fs: stopped at step" in page
-    assert "<svg" in page
-    assert main(command) == 2  # nothing is overwritten
+    assert manifest["fixed"]["stages.0.duration_ps"] == pytest.approx(12.0)
+    assert manifest["fixed"]["stages.0.friction_translation_per_ps"] is None  # not of rescaling
+    table = said[said.index("averages at a step of 0") : said.index("  files in")]
+    (again,) = (line for line in said.splitlines() if line.startswith("  rigidmd sweep "))
+    assert table in printed(*shlex.split(again)[1:]).out
+    rows = [line.split() for line in table.splitlines()]
+    (head,) = (row for row in rows if row[:2] == ["integrator", "thermostat"])
+    assert "off by 1% at (fs)" in " ".join(head)
+    with (folder / "extrapolation.csv").open(encoding="utf-8") as file:
+        limits = [row for row in csv.DictReader(file) if row["average"] == "Temperature (K)"]
+    assert [row["stages.0.integrator"] for row in limits] == ["velocity_verlet", "baoab"]
+    assert len({row["limit"] for row in limits}) == 1  # of the ensemble, by both methods
+    assert {row["degrees of freedom"] for row in limits} == {"3"}  # six means, limit, two slopes
+    page = (folder / "extrapolation.html").read_text("utf-8")
+    assert "off by 1% at (fs)" in page
 
 
 def test_averages_need_a_thermostat_at_one_temperature(capsys):
@@ -194,29 +165,34 @@ def test_averages_need_a_thermostat_at_one_temperature(capsys):
     assert main(["accuracy", water, "--sample-ps", "3"]) == 2
     assert "it needs --averages" in capsys.readouterr().err
     with pytest.raises(SceneError, match="A single body has no thermostat"):
-        measure_averages(Scene.read(TOP))
+        plan_averages(Scene.read(TOP), {})
     with pytest.raises(SceneError, match="one temperature and one pressure"):
-        measure_averages(springs(temperature_K=[300.0, 200.0]))
+        plan_averages(springs(temperature_K=[300.0, 200.0]), {})
     with pytest.raises(SceneError, match="unknown thermostat langevn; did you mean langevin"):
-        measure_averages(springs(), ["baoab+langevn"])
+        plan_averages(springs(), {}, ["baoab+langevn"])
     with pytest.raises(SceneError, match="unknown integrator verlet"):
-        measure_averages(springs(), ["verlet"])
+        plan_averages(springs(), {}, ["verlet"])
     with pytest.raises(SceneError, match="must be between"):
-        measure_averages(springs(), sample=0.0)
+        plan_averages(springs(), {}, sample=0.0)
 
 
-def test_methods_and_steps_that_are_averaged_by_default(monkeypatch):
-    monkeypatch.setattr(averages, "_sample", lambda *_: None)
-    found = measure_averages(springs(thermostat="nose_hoover", friction_translation_per_ps=None))
-    assert list(dict.fromkeys((run.integrator, run.thermostat) for run in found.runs)) == [
+def test_methods_and_steps_that_are_averaged_by_default():
+    scene = springs(thermostat="nose_hoover", friction_translation_per_ps=None)
+    plan = plan_averages(scene, {"seed": 5})
+    assert plan.methods == [
         ("baoab", "nose_hoover"),
         ("baoab", "velocity_rescaling"),
         ("baoab", "langevin"),
         ("velocity_verlet", "velocity_rescaling"),
     ]
+    axes = {axis.keys[0]: axis for axis in plan.axes}
+    assert axes["seed"] == (("seed",), (5,), False)
     longest = 2e3 * np.sqrt(39.948 / SPRING)
-    steps = [run.timestep for run in found.runs if run.thermostat == "langevin"]
+    steps = axes[plan.step_key].values
     assert steps == pytest.approx([share * longest for share in averages.LADDER], rel=0.05)
+    settings = dict(zip(SWEPT, ("velocity_verlet", "langevin", steps[0]), strict=True))
+    assert not plan.includes(settings)
+    assert plan.includes(settings | {SWEPT[1]: "velocity_rescaling"})
 
 
 @pytest.mark.soak

@@ -11,7 +11,11 @@ from rigidmd.core.integrators import SCHEMES
 from rigidmd.errors import SimulationError
 from rigidmd.features.bodies.trials import body_trial_system
 from rigidmd.features.studies.accuracy import measurement
-from rigidmd.features.studies.accuracy.accuracy import measure_accuracy, recommendations, table_text
+from rigidmd.features.studies.accuracy.accuracy import (
+    measure_accuracy,
+    recommendations,
+    trial_table,
+)
 from rigidmd.features.studies.accuracy.measurement import measure, time_span
 from rigidmd.run.trials import Method, Trial
 from rigidmd.scene import Scene
@@ -128,9 +132,9 @@ def test_a_step_that_is_too_long_diverges_and_is_stopped():
     assert not good.diverged
     assert bad.diverged
     assert bad.seconds == []
-    assert found.stable_step("velocity_verlet") == pytest.approx(1.0)
+    assert found.bounded("velocity_verlet")[0].timestep == pytest.approx(1.0)
     assert "velocity_verlet diverges beyond 1 fs" in "\n".join(recommendations(found))
-    assert "fails" in table_text(found)
+    assert "fails" in trial_table(found).text()
 
 
 def test_molecules_start_where_the_last_stage_does():
