@@ -107,21 +107,6 @@ class Column(NamedTuple, Generic[Row]):
     short: str = ""  # header for a terminal, if it is another one
 
 
-def with_error(
-    header: str,
-    measured: Callable[[Row], tuple[Cell, Cell] | None],
-) -> list[Column[Row]]:
-    """Columns of a value and its error. measured(row) : both, or None"""
-
-    def pair(row: Row) -> tuple[Cell, Cell]:
-        return measured(row) or (None, None)
-
-    return [
-        Column(header, lambda row: pair(row)[0]),
-        Column("±", lambda row: pair(row)[1]),
-    ]
-
-
 class ReportTable(NamedTuple, Generic[Row]):
     columns: list[Column[Row]]
     rows: Sequence[Row]

@@ -55,8 +55,9 @@ if TYPE_CHECKING:
     flag(
         "--averages",
         help=(
-            "molecules only: measure the bias of averages instead. The last stage is sampled"
-            " under its thermostat (nvt, npt) with every integrator at every step. --integrators"
+            "molecules only: measure the bias of averages instead, by a sweep of the last stage in"
+            " runs/NAME-averages under its thermostat (nvt, npt) over integrators and steps, with"
+            " --extrapolate. --integrators"
             " then accepts names with a thermostat, such as baoab+langevin (default: the method of"
             " the stage, baoab+velocity_rescaling, baoab+langevin,"
             " velocity_verlet+velocity_rescaling), and --timesteps has fractions of the longest"
@@ -83,7 +84,8 @@ def _accuracy(options: Options) -> int:
     from rigidmd.features.studies.accuracy import accuracy
 
     scene = read_scene(options)
-    folder = Path(options.output) if options.output else Path("runs") / f"{scene.name}-accuracy"
+    kind = "averages" if options.averages else "accuracy"
+    folder = Path(options.output or f"runs/{scene.name}-{kind}")
     integrators = options.integrators.split(",") if options.integrators else None
     try:
         timesteps = (

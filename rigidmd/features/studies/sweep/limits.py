@@ -40,8 +40,9 @@ from rigidmd.features.studies.sweep.table import (
     SweepRow,
     Table,
     key_cells,
+    measured_values,
     report_of,
-    table_of,
+    summarise_run,
 )
 from rigidmd.features.view.figures.style import curve_style, write_figure
 from rigidmd.features.view.page import code, items, plain, section, table, wide, write_page
@@ -49,6 +50,7 @@ from rigidmd.io.folder import add_to_folder
 from rigidmd.io.write import Cell, ReportTable, nine_digits
 from rigidmd.run.record import read_record
 from rigidmd.scene import Scene, is_molecular
+from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, BOLTZMANN
 
 if TYPE_CHECKING:
@@ -61,6 +63,7 @@ RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 #: Kinds of limits: of each average by itself; of energy and volume together, with the slopes that
 #: fluctuations predict; of responses, which fluctuations give.
 INDEPENDENT, JOINT, FLUCTUATIONS = "independent", "joint", "fluctuations"
+TOO_SHORT = "the runs are too short and too few for an error"
 #: Relative rounding error of a mean of equal numbers.
 ROUNDING = 1e-12
 TEMPERATURES = [
@@ -113,7 +116,7 @@ class Limit(NamedTuple):
         slope, error = self.fit.slopes.get(self.method, (0.0, 0.0))
         seen = abs(slope) > UNSEEN * error
         steepest = abs(slope) + (0.0 if seen else UNSEEN * error)
-        if self.scale is None or steepest == 0:
+        if not self.scale or steepest == 0:
             return None
         return (
             f"{'' if seen else '> '}{(BIAS_LIMIT * self.scale / steepest) ** (1 / self.order):.2g}"
@@ -218,40 +221,47 @@ def step_key(manifest: Manifest, key: str, scene: Scene) -> tuple[str, int]:
 
 
 @dataclass
-class _Average:
-    """An average of the combinations that differ in the step alone."""
+class _Series:
+    """What was measured of the runs that differ in the step and the seed alone, by the step (fs).
 
+    runs : column -> step -> value and error of each run; together : of runs analysed together
+    results : step -> results of each run for a joint fit; not_joint : why there are none
+    """
+
+    title: str  # describes `values`
     values: Json  # of the other keys
-    quantity: str
-    integrator: str
-    order: int
-    method: str  # the values of `OF_METHODS`, for averages of the log
-    scale: float | None
-    #: Step (fs) -> value and error of each run; -> value of the runs together.
-    runs: dict[float, list[Measured]] = field(default_factory=dict)
-    together: dict[float, Together] = field(default_factory=dict)
+    stage: Stage
+    scales: dict[str, float]
+    runs: dict[str, dict[float, list[Measured]]] = field(default_factory=dict)
+    together: dict[str, dict[float, Together]] = field(default_factory=dict)
+    results: dict[float, list[RunResults]] = field(default_factory=dict)
+    not_joint: dict[str, None] = field(default_factory=dict)
 
-    @property
-    def ensemble(self) -> tuple[str, str]:
-        """What averages by several methods have in common."""
-        values = {
-            key: value
-            for key, value in self.values.items()
-            if not (self.method and key.endswith(OF_METHODS))
-        }
-        return str(values), self.quantity
+    def of_method(self, column: str) -> Json:
+        """The values of keys on which a column does not depend at a step of 0: averages of the log
+        are the same for all methods."""
+        keys = [key for key in self.values if key.endswith(OF_METHODS) and column in OF_LOG]
+        return {key: self.values[key] for key in keys}
 
-    @property
-    def points(self) -> list[MeanAtStep]:
-        points = means_of_runs(self.runs, self.together)
-        return [point._replace(method=self.method, order=self.order) for point in points]
+    def ensemble(self, column: str) -> str:
+        """A column, and the values on which it depends."""
+        method = self.of_method(column)
+        return f"{column} {[(key, x) for key, x in self.values.items() if key not in method]}"
 
-    @property
-    def is_constant(self) -> bool:
+    def points(self, column: str) -> list[MeanAtStep]:
+        """Empty if runs are too short and too few."""
+        points = means_of_runs(self.runs.get(column, {}), self.together.get(column))
+        method, order = str(self.of_method(column)), self.stage.scheme.order
+        return [point._replace(method=method, order=order) for point in points]
+
+    def is_constant(self, column: str) -> bool:
         """Whether all values agree to rounding, as edges of a box that does not change."""
-        values = [value for measured in self.runs.values() for value, _ in measured]
-        values = np.array(values + [result.value for result in self.together.values()])
+        values = [value for of_step in self.runs.get(column, {}).values() for value, _ in of_step]
+        values += [value for value, *_ in self.together.get(column, {}).values()]
         return bool(np.ptp(values) <= ROUNDING * np.abs(values).max())
+
+    def describe(self, reason: str) -> str:
+        return f"{self.title}: {reason}" if self.title else reason
 
 
 def extrapolate_sweep(manifest: Manifest, key: str) -> Limits:
@@ -261,107 +271,72 @@ def extrapolate_sweep(manifest: Manifest, key: str) -> Limits:
     come from replicas together, if they have been analysed together, else from single runs. Raises
     SceneError if the key is not a swept time step, OutputError.
     """
-    limits, missing = [], []
-    ensembles: dict[tuple[str, str], list[tuple[_Average, list[MeanAtStep]]]] = {}
-    for average in _averages(manifest, key):
-        if average.quantity == DRIFT or average.is_constant:
-            continue
-        title = describe_values(average.values, short_keys(manifest.keys))
-        name = f"{title}: {average.quantity}" if title else average.quantity
-        if len(average.runs) < 2:
-            missing.append(f"{name}: has values at one step only")
-        elif points := average.points:
-            ensembles.setdefault(average.ensemble, []).append((average, points))
-        else:
-            missing.append(f"{name}: the runs are too short and too few for an error")
-    for averages in ensembles.values():
-        fit = extrapolate([point for _, points in averages for point in points])
-        for of, points in averages:
-            about = of.values, of.integrator, of.quantity
-            limits.append(Limit(*about, points, fit, INDEPENDENT, of.scale))
-    joint, not_joint = _joint_limits(manifest, key)
-    return Limits(manifest.name, key, limits + joint, missing, not_joint)
+    found = Limits(manifest.name, key, [], [], [])
+    all_series = _series(manifest, key)
+    ensembles: dict[str, list[tuple[_Series, str, list[MeanAtStep]]]] = {}
+    for series in all_series:
+        for column in series.runs | series.together:
+            if column == DRIFT or series.is_constant(column):
+                continue
+            if len({*series.runs.get(column, ()), *series.together.get(column, ())}) < 2:
+                found.missing.append(series.describe(f"{column}: has values at one step only"))
+            elif points := series.points(column):
+                members = ensembles.setdefault(series.ensemble(column), [])
+                members.append((series, column, points))
+            else:
+                found.missing.append(series.describe(f"{column}: {TOO_SHORT}"))
+    for members in ensembles.values():
+        fit = extrapolate([point for *_, points in members for point in points])
+        for series, column, points in members:
+            about = series.values, series.stage.integrator, column, points, fit
+            found.limits.append(Limit(*about, scale=series.scales.get(column)))
+    for series in all_series:
+        fits = fit_jointly(series.results)
+        for kind, by_quantity in ((JOINT, fits.joint), (FLUCTUATIONS, fits.responses)):
+            for name, of_quantity in by_quantity.items():
+                about = series.values, series.stage.integrator, name
+                found.limits.append(Limit(*about, *of_quantity, kind))
+        reasons = [*series.not_joint]
+        if series.results and not fits.joint:
+            reasons.append(TOO_SHORT)
+        found.not_joint.extend(map(series.describe, reasons))
+    return found
 
 
-@dataclass
-class _Combination:
-    """Results of the runs that differ in the step and the seed alone, by the step (fs)."""
-
-    values: Json
-    integrator: str = ""
-    runs: dict[float, list[RunResults]] = field(default_factory=dict)
-
-
-def _joint_limits(manifest: Manifest, key: str) -> tuple[list[Limit], list[str]]:
-    """Limits of joint fits and of responses, and sentences on what has none."""
-    combinations: dict[str, _Combination] = {}
-    reasons: dict[str, None] = {}
+def _series(manifest: Manifest, key: str) -> list[_Series]:
+    """Read all finished runs. The table of the sweep names those that cannot be read."""
+    found: dict[str, _Series] = {}
     short = short_keys(manifest.keys)
     for values, points in manifest.combinations():
+        series, step = None, 0.0
         for point in points:
             if point.state != "finished":
                 continue
+            folder = manifest.folder / point.folder
             try:
-                record = read_record(manifest.folder / point.folder)
-                found = results_of_run(record)
-            except RigidMDError:  # the table of the sweep names it
+                record = read_record(folder)
+                measured = summarise_run(record) | measured_values(read_table(folder).values())
+            except RigidMDError:
                 continue
             first, k = step_key(manifest, key, record.scene)
+            step = float(values[first])
             others = {name: value for name, value in values.items() if name != first}
             title = describe_values(others, short)
-            if isinstance(found, str):
-                reasons[f"{title}: {found}" if title else found] = None
-                continue
-            combination = combinations.setdefault(title, _Combination(others))
             stage = record.scene.stages[k]  # pyright: ignore[reportAttributeAccessIssue]  (it has them)
-            combination.integrator = stage.integrator
-            combination.runs.setdefault(float(values[first]), []).append(found)
-    limits = []
-    for title, combination in combinations.items():
-        fits = fit_jointly(combination.runs)
-        common = combination.values, combination.integrator
-        for kind, by_quantity in ((JOINT, fits.joint), (FLUCTUATIONS, fits.responses)):
-            limits += [Limit(*common, name, *fit, kind) for name, fit in by_quantity.items()]
-        if not fits.joint:
-            reason = "the runs are too short and too few for an error"
-            reasons[f"{title}: {reason}" if title else reason] = None
-    return limits, list(reasons)
-
-
-def _averages(manifest: Manifest, key: str) -> Iterator[_Average]:
-    averages: dict[tuple[str, str], _Average] = {}
-    short = short_keys(manifest.keys)
-    rows = table_of(manifest, with_analyses=True).rows
-    for row, (_, points) in zip(rows, manifest.combinations(), strict=True):
-        if not row.runs:
-            continue
-        point = next(point for point in points if point.state == "finished")
-        record = read_record(manifest.folder / point.folder)
-        first, k = step_key(manifest, key, record.scene)
-        stage = record.scene.stages[k]  # pyright: ignore[reportAttributeAccessIssue]  (it has stages)
-        step = float(row.values[first])
-        others = {name: value for name, value in row.values.items() if name != first}
-        of_method = {name: value for name, value in others.items() if name.endswith(OF_METHODS)}
-        method = describe_values(of_method, short)
-        scales = _scales(record.system, k) | {DENSITY: row[DENSITY][0]}
-        together = {}
-        if len(points) > 1:
-            together = _values_together(manifest.folder / point_name(row.values, short))
-        measured = {column: None for run in row.runs.values() for column in run}
-        for column in measured | together:
-            average = _Average(
-                others,
-                column,
-                stage.integrator,
-                stage.scheme.order,
-                method if column in OF_LOG else "",
-                scales.get(column),
-            )
-            average = averages.setdefault((describe_values(others, short), column), average)
-            average.runs[step] = [run[column] for run in row.runs.values() if column in run]
-            if column in together:
-                average.together[step] = together[column]
-    yield from averages.values()
+            scales = _scales(record.system, k) | {DENSITY: measured.get(DENSITY, (0.0,))[0]}
+            series = found.setdefault(title, _Series(title, others, stage, scales))
+            for column, value in measured.items():
+                series.runs.setdefault(column, {}).setdefault(step, []).append(value)
+            results = results_of_run(record)
+            if isinstance(results, str):
+                series.not_joint[results] = None
+            else:
+                series.results.setdefault(step, []).append(results)
+        if series is not None and len(points) > 1:
+            folder = manifest.folder / point_name(values, short)
+            for column, value in _values_together(folder).items():
+                series.together.setdefault(column, {})[step] = value
+    return [*found.values()]
 
 
 def _scales(system: System, k: int) -> dict[str, float]:
@@ -373,11 +348,10 @@ def _scales(system: System, k: int) -> dict[str, float]:
     temperature = stage.temperatures[0]
     count = len(system.model.species)
     per_molecule = system.freedom_in(k).total / count
-    scales = dict.fromkeys(TEMPERATURES, temperature)
-    scales[POTENTIAL] = GAS_CONSTANT * temperature * per_molecule
-    if system.space.volume < np.inf:
-        scales[PRESSURE] = count * BOLTZMANN * temperature / system.space.volume / BAR
-    return scales
+    return dict.fromkeys(TEMPERATURES, temperature) | {
+        POTENTIAL: GAS_CONSTANT * temperature * per_molecule,
+        PRESSURE: count * BOLTZMANN * temperature / system.space.volume / BAR,
+    }
 
 
 def _values_together(folder: Path) -> dict[str, Together]:

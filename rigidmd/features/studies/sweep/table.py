@@ -16,7 +16,7 @@ from rigidmd.core.toml import Json
 from rigidmd.engines.samples import IN_LOGS, NOT_AVERAGED
 from rigidmd.engines.system import System
 from rigidmd.errors import RigidMDError
-from rigidmd.features.analysis.files import TableEntry, read_table
+from rigidmd.features.analysis.files import TableEntry
 from rigidmd.features.analysis.result import AnalysisResult
 from rigidmd.features.analysis.rigid_frames import earlier_production, production_samples
 from rigidmd.features.studies.kind_study import Measured, studies, study_of
@@ -175,9 +175,8 @@ def key_cells(values: Json) -> dict[str, Cell]:
     }
 
 
-def table_of(manifest: Manifest, with_analyses: bool = False) -> Table:
-    """The table of the points that have finished. with_analyses : also of the values of analyses in
-    their folders"""
+def table_of(manifest: Manifest) -> Table:
+    """The table of the points that have finished."""
     keys = [key for key in manifest.keys if key != SEED]
     table = Table(manifest.folder, keys, [], [], together=manifest.keys)
     columns: dict[str, None] = {}
@@ -189,8 +188,6 @@ def table_of(manifest: Manifest, with_analyses: bool = False) -> Table:
                 continue
             try:
                 results = summarise_run(read_record(folder))
-                if with_analyses:
-                    results |= measured_values(read_table(folder).values())
             except RigidMDError as error:
                 table.failed[point.folder] = str(error)
                 continue
