@@ -5,8 +5,8 @@ from math import expm1, inf, log, sinh
 
 import numpy as np
 from scipy.integrate import solve_ivp
-from scipy.special import ellipkm1
 
+from rigidmd.features.bodies.theory import free_body_period
 from rigidmd.features.studies.stability.cases import Trial, builder
 from rigidmd.mechanics.rotation import from_euler_angles, from_quaternion, from_vector
 from rigidmd.run.results import Results
@@ -80,7 +80,8 @@ def first_flip(trial: Trial, off: float) -> Trials:
     Only the first is compared: later flips are earlier, because rounding of omega leaves the body
     1e-8 off the axis.
     """
-    known = quarter_period(off, *trial.scene["body"]["inertia_kg_m2"])
+    inertia = np.array(trial.scene["body"]["inertia_kg_m2"])
+    known = free_body_period(inertia, np.array([off, 1.0, 0.0])) / 4
     growth_rate = 3**-0.5  # of the distance from the axis, sqrt((I2 - I1)(I3 - I2)/(I1 I3))
     span = 10 * max(known, log(1e8) / growth_rate)
 
@@ -100,17 +101,6 @@ def flip_times(results: Results) -> np.ndarray:
     before = np.flatnonzero(np.diff(np.sign(spin)))
     fraction = spin[before] / (spin[before] - spin[before + 1])
     return time[before] + fraction * (time[before + 1] - time[before])
-
-
-def quarter_period(off: float, i1: float, i2: float, i3: float) -> float:
-    """Time from omega = (off, 1, 0) to omega_2 = 0, I1 < I2 < I3: K(m)/p, a quarter of the period.
-
-    p² = (I2 - I1) A/(I1 I2 I3) and 1 - m = I1 (I3 - I1) off²/A with A = 2T I3 - L² (Landau &
-    Lifshitz, Mechanics, section 37, axes 1 and 3 exchanged).
-    """
-    excess = i1 * (i3 - i1) * off**2 + i2 * (i3 - i2)
-    rate = ((i2 - i1) * excess / (i1 * i2 * i3)) ** 0.5
-    return float(ellipkm1(i1 * (i3 - i1) * off**2 / excess) / rate)
 
 
 @builder

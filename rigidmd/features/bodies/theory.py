@@ -4,11 +4,39 @@ on.
 In consistent units. See "Tops in gravity" in the theory chapter `bodies`.
 """
 
+from math import inf, pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.features.bodies.elliptic import complete, rf, rj
+#: The algorithm converges quadratically: the next step changes the last bit at most.
+SQUARE_ROOT_OF_ROUNDING = 1e-8
+
+
+def complete_integral(complement: float, p: float = 1.0) -> float:
+    """The complete elliptic integral of the third kind, Π(n, m) with m = 1 - `complement` and n = 1
+    - p, by Bulirsch's algorithm (Numerische Mathematik 13, 305, 1969). By default K(m), that of the
+    first kind. Infinite unless both arguments are positive.
+
+    SciPy has it too, and takes longer to import than a top to run.
+    """
+    if not (complement > 0 and p > 0):
+        return inf
+    p = sqrt(p)
+    a, b = 1.0, 1 / p
+    side = product = sqrt(complement)
+    total = 1.0
+    while True:
+        before = a
+        a += b / p
+        b = 2 * (b + before * product / p)
+        p += product / p
+        before = total
+        total += side
+        if abs(before - side) <= SQUARE_ROOT_OF_ROUNDING * before:
+            return pi / 2 * (b + a * total) / (total * (total + p))
+        side = 2 * sqrt(product)
+        product = side * total
 
 
 class TopMotion(NamedTuple):
@@ -36,7 +64,7 @@ def heavy_top_motion(
 
     u = cos theta oscillates between the lower two roots of a cubic (Whittaker, section 71), here in
     x = u - u0, in which fast tops have no cancellation. The angle of precession is a sum of
-    elliptic integrals of the third kind, of 1/(1 - u) and 1/(1 + u), by Carlson's forms.
+    elliptic integrals of the third kind, of 1/(1 - u) and 1/(1 + u).
     """
     alpha = 2 * moment / across
     kappa = transverse / across**2
@@ -69,9 +97,8 @@ def heavy_top_motion(
         # without weight the axis does not circle this pole
         if distance > 0 and abs(weight) > np.finfo(float).eps * (abs(w) + abs(c)):
             n = pole * (high - low) / distance
-            third = rf(0, complement, 1) + n / 3 * rj(0, complement, 1, float(1 - n))
-            angle += weight / distance * third
-    first = complete(complement)
+            angle += weight / distance * complete_integral(complement, float(1 - n))
+    first = complete_integral(complement)
     return TopMotion(float(angle / first / 2), float(2 * first / rate))
 
 
@@ -94,4 +121,4 @@ def free_body_period(inertia: np.ndarray, omega: np.ndarray) -> float:
         rate, complement = (a - b) * from_high, (a - c) * from_middle
     if not (complement > 0 and rate > 0):
         return float("inf")
-    return float(4 * complete(float(complement / rate)) / np.sqrt(rate / (a * b * c)))
+    return float(4 * complete_integral(float(complement / rate)) / np.sqrt(rate / (a * b * c)))
