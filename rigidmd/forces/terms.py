@@ -13,7 +13,6 @@ from functools import partial
 from typing import Literal, NamedTuple, overload
 
 import numpy as np
-from numba import literal_unroll
 
 from rigidmd.compile import (
     ALWAYS,
@@ -317,11 +316,10 @@ def compute_load_with_energies(table, force, torque_body):
 @chosen_by_type
 def compute_load(terms, state, load, which):
     """Write the forces and torques of all terms at the current positions. The worst status code.
-    terms : a tuple of terms, which gives forces only, or a `TermTable`, which gets energies and
-    virials. which : FORCES_ONLY, WITH_ENERGIES, INTO_OTHER_LOAD or WITH_VIRIALS. `load` must be the
-    load that it means."""
+    terms : a `TermTable`, which gets energies and virials. which : FORCES_ONLY, WITH_ENERGIES,
+    INTO_OTHER_LOAD or WITH_VIRIALS. `load` must be the load that it means."""
     if not is_a(terms, TermTable):
-        return lambda terms, state, load, which: compute_body_load(terms, state, load)
+        return None
 
     def load_by_passes(terms, state, load, which):
         clear(load.force)
@@ -351,26 +349,6 @@ def copy(source, target):
     """target[:] = source, likewise."""
     for n, value in enumerate(source.flat):
         target.flat[n] = value
-
-
-@kernel(inline=True)
-def compute_body_load(terms, state, load):
-    """Write the forces and torques of all terms (a tuple) at the current positions. The worst
-    status code."""
-    load.force[:] = 0.0
-    load.torque_body[:] = 0.0
-    status = OK
-    for term in literal_unroll(terms):
-        status = worse_status(status, add_forces(term, state, load, None))
-    return status
-
-
-@kernel
-def total_power(terms, state, velocity, omega):
-    total = 0.0
-    for term in literal_unroll(terms):
-        total += power(term, state, velocity, omega)
-    return total
 
 
 @kernel

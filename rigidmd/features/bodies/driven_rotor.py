@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from rigidmd.compile import chosen_by_type, is_a, kernel
-from rigidmd.core.state import WORK
+from rigidmd.core.state import NOW, WORK
 from rigidmd.features.bodies.time_functions import TimeFunction, rate, value
 from rigidmd.mechanics.free_rotor import NoRotor, rotate, rotate_about_axes
 
@@ -26,15 +26,10 @@ def rotate_body(rotor, state, time, h):
         )
 
     def rotate_driven(rotor, state, time, h):
-        L, inertia, carried = state.angular_momentum_body, rotor.inertia, rotor.momentum
+        L = state.angular_momentum_body
         before = driven_energy(rotor, L, time)
         middle = time + 0.5 * h
-        inverse = (
-            1 / value(inertia, middle, 0),
-            1 / value(inertia, middle, 1),
-            1 / value(inertia, middle, 2),
-        )
-        offset = value(carried, middle, 0), value(carried, middle, 1), value(carried, middle, 2)
+        inverse, offset = all_moments(rotor, middle)
         state.energy_ledger[WORK] += driven_energy(rotor, L, middle) - before
         rotate_about_axes(state.rotation, L, 0, (0, 1, 2), inverse, offset, h)
         state.energy_ledger[WORK] += driven_energy(rotor, L, time + h) - driven_energy(
@@ -65,6 +60,28 @@ def moments(rotor, time, k):
     if is_a(rotor, NoRotor):
         return lambda rotor, time, k: (0.0, 0.0)
     return lambda rotor, time, k: (rotor.inverse_inertia[0, k], 0.0)
+
+
+@kernel(inline=True)
+def all_moments(rotor, time):
+    """`moments` of all axes: 1/I (3,) and h (3,) as tuples."""
+    i0, h0 = moments(rotor, time, 0)
+    i1, h1 = moments(rotor, time, 1)
+    i2, h2 = moments(rotor, time, 2)
+    return (i0, i1, i2), (h0, h1, h2)
+
+
+@kernel(inline=True)
+def omega_in_frame(rotor, state, frame_body):
+    """Angular velocity along the body axes relative to a frame, whose rate is `frame_body` along
+    them, as a tuple."""
+    L = state.angular_momentum_body[0]
+    i, h = all_moments(rotor, state.time[NOW])
+    return (
+        (L[0] - h[0]) * i[0] - frame_body[0],
+        (L[1] - h[1]) * i[1] - frame_body[1],
+        (L[2] - h[2]) * i[2] - frame_body[2],
+    )
 
 
 @chosen_by_type(inline=True)

@@ -4,6 +4,7 @@ has is compiled."""
 from typing import NamedTuple
 
 import numpy as np
+from numba import literal_unroll
 
 from rigidmd.compile import chosen_by_type, implements, is_a, kernel
 from rigidmd.core.integrators import DRIFT, KICK, Scheme
@@ -14,7 +15,7 @@ from rigidmd.dynamics.force_gradient import (
     displace,
     evaluate,
 )
-from rigidmd.features.bodies.driven_rotor import DrivenRotor, moments
+from rigidmd.features.bodies.driven_rotor import DrivenRotor, all_moments, omega_in_frame
 from rigidmd.features.bodies.forces.resistance import NoResistance, Resistance, kick_with_resistance
 from rigidmd.features.bodies.translation import (
     FluidTranslation,
@@ -22,12 +23,12 @@ from rigidmd.features.bodies.translation import (
     InertialFrame,
     NoTranslation,
     RotatingFrame,
+    all_inertial_masses,
     frame_rate,
-    inertial_mass,
     rotate_with_frame,
     translate,
 )
-from rigidmd.forces.terms import compute_body_load, total_power, trait
+from rigidmd.forces.terms import TermTable, add_forces, compute_load, power, trait, worse_status
 from rigidmd.mechanics.free_rotor import (
     ORTHOGONALITY_INTERVAL,
     ExactRotor,
@@ -36,7 +37,7 @@ from rigidmd.mechanics.free_rotor import (
     restore_orthogonality,
     rotate_by_vector,
 )
-from rigidmd.mechanics.vectors import body_component, body_vector, lab_vector
+from rigidmd.mechanics.vectors import body_vector, lab_vector
 
 #: Indices of the progress of a step: flows done; whether the load belongs to the current positions
 #: (1), and the load of a kick with gradient too (2).
@@ -157,33 +158,53 @@ def _evaluate(model, state, load, terms, gradient_workspace, tau, known):
     )
 
 
+@kernel(inline=True)
+def compute_body_load(terms, state, load):
+    """Write the forces and torques of all terms (a tuple) at the current positions. The worst
+    status code."""
+    load.force[:] = 0.0
+    load.torque_body[:] = 0.0
+    status = OK
+    for term in literal_unroll(terms):
+        status = worse_status(status, add_forces(term, state, load, None))
+    return status
+
+
+@implements(compute_load)
+def _compute_load(terms, state, load, which):
+    """Of a tuple of terms, the forces only."""
+    if is_a(terms, TermTable):
+        return None
+    return lambda terms, state, load, which: compute_body_load(terms, state, load)
+
+
+@kernel
+def total_power(terms, state, velocity, omega):
+    total = 0.0
+    for term in literal_unroll(terms):
+        total += power(term, state, velocity, omega)
+    return total
+
+
 @implements(displace, Body, inline=True)
 def _displace_body(model, state, load, tau):
     for k in range(len(load.force)):
         for i in range(3):
             state.position[k, i] += tau / model.translation.mass * load.force[k, i]
     for k in range(len(load.torque_body)):
-        n, t = load.torque_body[k], state.time[NOW]
-        i0, i1, i2 = (
-            moments(model.rotor, t, 0)[0],
-            moments(model.rotor, t, 1)[0],
-            moments(model.rotor, t, 2)[0],
-        )
-        rotate_by_vector(state.rotation[k], tau * i0 * n[0], tau * i1 * n[1], tau * i2 * n[2])
+        n = load.torque_body[k]
+        i, _ = all_moments(model.rotor, state.time[NOW])
+        rotate_by_vector(state.rotation[k], tau * i[0] * n[0], tau * i[1] * n[1], tau * i[2] * n[2])
 
 
 @implements(add_gyration, Body, inline=True)
 def _add_gyration_of_body(model, load, tau, gain):
     for b in range(len(load.torque_body)):
         n = load.torque_body[b]
-        i0, i1, i2 = (
-            moments(model.rotor, 0.0, 0)[0],
-            moments(model.rotor, 0.0, 1)[0],
-            moments(model.rotor, 0.0, 2)[0],
-        )
-        gain.torque_body[b, 0] += tau * (i1 - i2) * n[1] * n[2]
-        gain.torque_body[b, 1] += tau * (i2 - i0) * n[2] * n[0]
-        gain.torque_body[b, 2] += tau * (i0 - i1) * n[0] * n[1]
+        i, _ = all_moments(model.rotor, 0.0)
+        gain.torque_body[b, 0] += tau * (i[1] - i[2]) * n[1] * n[2]
+        gain.torque_body[b, 1] += tau * (i[2] - i[0]) * n[2] * n[0]
+        gain.torque_body[b, 2] += tau * (i[0] - i[1]) * n[0] * n[1]
 
 
 @chosen_by_type(inline=True)
@@ -210,23 +231,10 @@ def relative_motion(model, state):
         V = state.velocity[0]
         velocity = (V[0], V[1], V[2])
         if len(state.rotation):
-            q = state.rotation[0]
-            a = (
-                body_component(q, V, 0)
-                * model.translation.mass
-                / inertial_mass(model.translation, 0)
-            )
-            b = (
-                body_component(q, V, 1)
-                * model.translation.mass
-                / inertial_mass(model.translation, 1)
-            )
-            c = (
-                body_component(q, V, 2)
-                * model.translation.mass
-                / inertial_mass(model.translation, 2)
-            )
-            velocity = lab_vector(q, a, b, c)
+            q, mass = state.rotation[0], model.translation.mass
+            a, b, c = body_vector(q, V)
+            m0, m1, m2 = all_inertial_masses(model.translation)
+            velocity = lab_vector(q, a * mass / m0, b * mass / m1, c * mass / m2)
         x = state.position[0]
         u, v, w = velocity
         velocity = (
@@ -235,11 +243,5 @@ def relative_motion(model, state):
             w - W[0] * x[1] + W[1] * x[0],
         )
     if len(state.rotation):
-        q = state.rotation[0]
-        L = state.angular_momentum_body[0]
-        i0, h0 = moments(model.rotor, state.time[NOW], 0)
-        i1, h1 = moments(model.rotor, state.time[NOW], 1)
-        i2, h2 = moments(model.rotor, state.time[NOW], 2)
-        drag = body_vector(q, W)
-        omega = ((L[0] - h0) * i0 - drag[0], (L[1] - h1) * i1 - drag[1], (L[2] - h2) * i2 - drag[2])
+        omega = omega_in_frame(model.rotor, state, body_vector(state.rotation[0], W))
     return velocity, omega

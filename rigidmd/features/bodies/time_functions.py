@@ -116,6 +116,12 @@ def value(function, time, k):
 
 
 @kernel(inline=True)
+def vector_at(function, time):
+    """A function of time with three components, as a tuple."""
+    return value(function, time, 0), value(function, time, 1), value(function, time, 2)
+
+
+@kernel(inline=True)
 def rate(function, time, k):
     """Rate of change of component k at a time, from the first piece."""
     return function.slope[0, k] + 2 * (time - function.times[0]) * function.curvature[0, k]

@@ -9,9 +9,9 @@ import numpy as np
 
 from rigidmd.compile import chosen_by_type, is_a, kernel
 from rigidmd.features.bodies.driven_rotor import rotate_body
-from rigidmd.features.bodies.time_functions import TimeFunction, value
+from rigidmd.features.bodies.time_functions import TimeFunction, vector_at
 from rigidmd.mechanics.free_rotor import rotate_vector, sine_and_versine
-from rigidmd.mechanics.vectors import body_component
+from rigidmd.mechanics.vectors import body_vector, lab_vector
 
 
 class FreeTranslation(NamedTuple):
@@ -61,14 +61,13 @@ def translate(translation, rotor, state, time, h):
 def translate_in_fluid(translation, state, h):
     """Exact flow of sum P_k²/(2 M_k): P and Q are constant, X += h Q v, L += h P x v."""
     q = state.rotation[0]
-    p0 = translation.mass * body_component(q, state.velocity[0], 0)
-    p1 = translation.mass * body_component(q, state.velocity[0], 1)
-    p2 = translation.mass * body_component(q, state.velocity[0], 2)
-    v0 = p0 / translation.inertial_mass[0]
-    v1 = p1 / translation.inertial_mass[1]
-    v2 = p2 / translation.inertial_mass[2]
+    a, b, c = body_vector(q, state.velocity[0])
+    p0, p1, p2 = translation.mass * a, translation.mass * b, translation.mass * c
+    m0, m1, m2 = all_inertial_masses(translation)
+    v0, v1, v2 = p0 / m0, p1 / m1, p2 / m2
+    u = lab_vector(q, v0, v1, v2)
     for k in range(3):
-        state.position[0, k] += h * (q[k, 0] * v0 + q[k, 1] * v1 + q[k, 2] * v2)
+        state.position[0, k] += h * u[k]
     state.angular_momentum_body[0, 0] += h * (p1 * v2 - p2 * v1)
     state.angular_momentum_body[0, 1] += h * (p2 * v0 - p0 * v2)
     state.angular_momentum_body[0, 2] += h * (p0 * v1 - p1 * v0)
@@ -80,6 +79,13 @@ def inertial_mass(translation, k):
     if is_a(translation, FluidTranslation):
         return lambda translation, k: translation.inertial_mass[k]
     return lambda translation, k: translation.mass
+
+
+@kernel(inline=True)
+def all_inertial_masses(translation):
+    """`inertial_mass` along all body axes, as a tuple."""
+    t = translation
+    return inertial_mass(t, 0), inertial_mass(t, 1), inertial_mass(t, 2)
 
 
 def inertial_masses(translation: FreeTranslation | NoTranslation | FluidTranslation) -> np.ndarray:
@@ -139,8 +145,4 @@ def frame_rate(frame, time):
     if is_a(frame, InertialFrame):
         return lambda frame, time: (0.0, 0.0, 0.0)
 
-    def rate(frame, time):
-        omega = frame.angular_velocity
-        return value(omega, time, 0), value(omega, time, 1), value(omega, time, 2)
-
-    return rate
+    return lambda frame, time: vector_at(frame.angular_velocity, time)

@@ -8,9 +8,9 @@ import numpy as np
 
 from rigidmd.compile import implements, kernel
 from rigidmd.core.state import NEEDS_PYTHON_FORCES, OK, State
-from rigidmd.features.bodies.time_functions import TimeFunction, value
+from rigidmd.features.bodies.time_functions import TimeFunction, vector_at
 from rigidmd.forces.terms import Setup, add_forces, power
-from rigidmd.mechanics.vectors import body_component, body_vector
+from rigidmd.mechanics.vectors import body_component, body_vector, lab_vector
 
 
 class SteadyForce(NamedTuple):
@@ -118,16 +118,16 @@ def add_torque(point, rotation, force_lab, torque_body):
 @implements(add_forces, TimeDependentForceWorkspace)
 def _add_time_dependent_force(term, state, load, tally):
     now = state.time[0]
-    force = (value(term.force, now, 0), value(term.force, now, 1), value(term.force, now, 2))
-    torque = (value(term.torque, now, 0), value(term.torque, now, 1), value(term.torque, now, 2))
+    force, torque = vector_at(term.force, now), vector_at(term.torque, now)
     for k in range(3):
         term.force_lab[k] = force[k]
         term.torque_body[k] = torque[k]
     if len(state.rotation):
         q = state.rotation[0]
+        along_lab = lab_vector(q, force[0], force[1], force[2])
         for k in range(3):
             if term.follows_body:
-                term.force_lab[k] = q[k, 0] * force[0] + q[k, 1] * force[1] + q[k, 2] * force[2]
+                term.force_lab[k] = along_lab[k]
             else:
                 term.torque_body[k] = body_component(q, torque, k)
         add_torque(term.point, q, term.force_lab, term.torque_body)

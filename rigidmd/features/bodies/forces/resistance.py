@@ -9,8 +9,8 @@ import numpy as np
 
 from rigidmd.compile import chosen_by_type, is_a, kernel
 from rigidmd.core.state import WORK
-from rigidmd.features.bodies.driven_rotor import moments
-from rigidmd.features.bodies.translation import NoTranslation, frame_rate, inertial_mass
+from rigidmd.features.bodies.driven_rotor import all_moments, moments, omega_in_frame
+from rigidmd.features.bodies.translation import NoTranslation, all_inertial_masses, frame_rate
 from rigidmd.mechanics.free_rotor import NoRotor
 from rigidmd.mechanics.vectors import body_component, body_vector
 
@@ -66,27 +66,17 @@ def kick_with_resistance(resistance, translation, rotor, frame, state, load, h):
 @kernel
 def kick_rotation(resistance, rotor, frame, state, load, h):
     """Change L by torque and resistance. |w| is its value at the middle of the kick."""
-    W = frame_rate(frame, state.time[0])
-    q = state.rotation[0]
-    L = state.angular_momentum_body[0]
-    i0, h0 = moments(rotor, state.time[0], 0)
-    i1, h1 = moments(rotor, state.time[0], 1)
-    i2, h2 = moments(rotor, state.time[0], 2)
-    inverse, carried = (i0, i1, i2), (h0, h1, h2)
-    dragged = body_vector(q, W)
-    before = (
-        (L[0] - h0) * i0 - dragged[0],
-        (L[1] - h1) * i1 - dragged[1],
-        (L[2] - h2) * i2 - dragged[2],
-    )
-    torque = load.torque_body[0]
-    pushes = (i0 * torque[0], i1 * torque[1], i2 * torque[2])
+    L, torque = state.angular_momentum_body[0], load.torque_body[0]
+    inverse, carried = all_moments(rotor, state.time[0])
+    dragged = body_vector(state.rotation[0], frame_rate(frame, state.time[0]))
+    before = omega_in_frame(rotor, state, dragged)
+    pushes = times(inverse, torque)
     dry, linear, quadratic = (
         resistance.rotation_dry,
         resistance.rotation_linear,
         resistance.rotation_quadratic,
     )
-    dries = (i0 * dry[0], i1 * dry[1], i2 * dry[2])
+    dries = times(inverse, dry)
     size = midpoint_speed(before, pushes, dries, inverse, linear, quadratic, h)
     for k in range(3):
         if inverse[k] > 0.0:
@@ -96,6 +86,12 @@ def kick_rotation(resistance, rotor, frame, state, load, h):
             state.energy_ledger[WORK] += (
                 0.5 * (after - before[k]) * (after + before[k]) - pushes[k] * turned
             ) / inverse[k]
+
+
+@kernel(inline=True)
+def times(a, b):
+    """The products of components, as a tuple."""
+    return a[0] * b[0], a[1] * b[1], a[2] * b[2]
 
 
 @kernel
@@ -159,29 +155,18 @@ def kick_translation(resistance, translation, rotor, frame, state, load, h):
         V = state.velocity[0]
         F = load.force[0]
         wind = (W[1] * x[2] - W[2] * x[1], W[2] * x[0] - W[0] * x[2], W[0] * x[1] - W[1] * x[0])
-        mass = (
-            inertial_mass(translation, 0),
-            inertial_mass(translation, 1),
-            inertial_mass(translation, 2),
-        )
+        mass = all_inertial_masses(translation)
         inverse = (1 / mass[0], 1 / mass[1], 1 / mass[2])
         if turns:
             q = state.rotation[0]
             v, u, f = body_vector(q, V), body_vector(q, wind), body_vector(q, F)
-            per_momentum = (
-                translation.mass * inverse[0],
-                translation.mass * inverse[1],
-                translation.mass * inverse[2],
-            )
-            before = (
-                per_momentum[0] * v[0] - u[0],
-                per_momentum[1] * v[1] - u[1],
-                per_momentum[2] * v[2] - u[2],
-            )
-            pulls = (f[0] * inverse[0], f[1] * inverse[1], f[2] * inverse[2])
+            m = translation.mass
+            along = times((m * inverse[0], m * inverse[1], m * inverse[2]), v)
+            before = (along[0] - u[0], along[1] - u[1], along[2] - u[2])
+            pulls = times(inverse, f)
         else:
             before = (V[0] - wind[0], V[1] - wind[1], V[2] - wind[2])
-            pulls = (F[0] * inverse[0], F[1] * inverse[1], F[2] * inverse[2])
+            pulls = times(inverse, F)
         linear, quadratic = resistance.linear, resistance.quadratic
         size = midpoint_speed(before, pulls, (0.0, 0.0, 0.0), inverse, linear, quadratic, h)
         for k in range(3):

@@ -8,9 +8,8 @@ from rigidmd.core.state import NOW, OK, ORIGIN, WORK
 from rigidmd.features.bodies.driven_rotor import moment_rates
 from rigidmd.features.bodies.forces.resistance import add_resistance
 from rigidmd.features.bodies.ode.odes import attitude_rates, write_rotation
-from rigidmd.features.bodies.step_loop import relative_motion
+from rigidmd.features.bodies.step_loop import compute_body_load, relative_motion, total_power
 from rigidmd.features.bodies.translation import frame_rate, inertial_mass
-from rigidmd.forces.terms import compute_body_load, total_power
 from rigidmd.mechanics.vectors import body_component
 
 SINGULAR = 5  # status code beyond those of core.state: Euler angles too near theta = 0 or pi
