@@ -150,6 +150,18 @@ def array_errors(
     return errors
 
 
+def errors_of_arrays(state: State, like: State, about: str) -> list[str]:
+    """Messages on the arrays of a state from outside, which have other shapes than those of another
+    state, or values that no state has. about : the other state"""
+    names = State._fields[:5]
+    if masked := [name for name in names if np.ma.is_masked(getattr(state, name))]:
+        return [f"{name} of the state has masked values, not numbers" for name in masked]
+    arrays = {name: np.asarray(getattr(state, name)) for name in names}
+    shapes = {name: getattr(like, name).shape for name in names}
+    errors = array_errors(arrays, shapes)
+    return [f"{name} of the state {error}; {about}" for name, error in errors.items()]
+
+
 def are_rotations(matrices: np.ndarray) -> bool:
     """Whether matrices (n, 3, 3) are rotations, within NOT_A_ROTATION."""
     gap = np.swapaxes(matrices, 1, 2) @ matrices - np.eye(3)

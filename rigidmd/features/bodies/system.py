@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidmd.core.integrators import RK4, SCHEMES, SOLVERS, Scheme, Solver
 from rigidmd.core.state import State
-from rigidmd.core.state_file import array_errors
+from rigidmd.core.state_file import errors_of_arrays
 from rigidmd.engines.sites import Sites
 from rigidmd.errors import SimulationError
 from rigidmd.features.bodies.cpu_engine import BodyEngine
@@ -148,16 +148,12 @@ class BodySystem:
 
     def state_errors(self, state: State) -> list[str]:
         """Messages on positions and momenta of a state from outside which this body cannot have."""
-        names = State._fields[:5]
-        arrays = {name: np.asarray(getattr(state, name)) for name in names}
-        shapes = {name: getattr(self.state, name).shape for name in names}
-        if problems := array_errors(arrays, shapes):
-            pinned = "" if self.translates else ", pinned"
-            about = f"the scene is a single body{pinned}"
-            return [f"{name} of the state {problem}; {about}" for name, problem in problems.items()]
-        if np.isfinite(arrays["cell"]).all():
+        pinned = "" if self.translates else ", pinned"
+        if errors := errors_of_arrays(state, self.state, f"the scene is a single body{pinned}"):
+            return errors
+        if np.isfinite(state.cell).all():
             return ["the state has a periodic box, and a single body has none"]
-        momentum = np.abs(arrays["angular_momentum_body"])
+        momentum = np.abs(state.angular_momentum_body)
         along = momentum[:, (self.inertia == 0) & (not isinstance(self.body.rotor, DrivenRotor))]
         if along.max(initial=0.0) > ROUNDING * momentum.max(initial=0.0):
             return ["angular_momentum_body of the state is not 0 about an axis without inertia"]
