@@ -56,8 +56,6 @@ class Row:
     programs: tuple[str, ...] = ()  # folders with a program, see `core.programs`
     thermostats: tuple[str, ...] = ()  # modules with a METHOD, see `scene.ensemble_methods`
     barostats: tuple[str, ...] = ()  # the same
-    #: Columns of the log that only its scenes have: name, header, unit, description
-    columns: tuple[tuple[str, str, str, str], ...] = ()
     display: str = ""  # the module that registers functions of `core.display`
 
     @property

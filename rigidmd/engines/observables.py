@@ -1,13 +1,15 @@
 """Observables of molecules at one state: energies, temperatures, pressure, momentum and the
 orthogonality of Q."""
 
-from math import hypot, inf, isfinite, nan
-from typing import NamedTuple, cast
+from dataclasses import dataclass, field
+from math import inf, nan
+from typing import cast
 
 import numpy as np
 
-from rigidmd.core.state import HEAT, NOW, WORK, Load, State, edges_and_angles
-from rigidmd.dynamics.observables import sums_of_state
+from rigidmd.core.quantities import QUANTITIES
+from rigidmd.core.state import NOW, Load, State, edges_and_angles
+from rigidmd.dynamics.observables import StateSums, sums_of_state
 from rigidmd.engines.protocol import Engine
 from rigidmd.engines.samples import Sample
 from rigidmd.engines.system import System
@@ -15,53 +17,72 @@ from rigidmd.forces.ewald.interactions import NEUTRAL
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.potentials.coulomb import ReactionField
 from rigidmd.forces.potentials.truncation import Unmodified
-from rigidmd.units import BAR, BOLTZMANN, GRAM_PER_CM3, KJ_PER_MOL
+from rigidmd.units import BAR, BOLTZMANN, KJ_PER_MOL
 
 UNIT = np.eye(3)
-#: Columns of the box, and of the pressure tensor with their entries in it.
-EDGES = ("a", "b", "c", "alpha", "beta", "gamma")
-COMPONENTS = {
-    f"pressure_{'xyz'[i]}{'xyz'[j]}": (i, j)
-    for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-}
 
 
-class Observation(NamedTuple):
+@dataclass(repr=False)
+class Observation:
     """The observables of molecules at one state: a line of the log, and what the log does not have.
 
-    The columns of the line are attributes too, such as `potential`, all but the size of the
-    momentum. Energies are in the unit that `observe` was given, kJ/mol in a run. Quantities that do
-    not exist are NaN.
+    The columns of the line are attributes too, such as `temperature`. Energies are in the unit that
+    `observe` was given, kJ/mol in a run. Quantities that do not exist are NaN.
     """
 
-    sample: Sample
-    components: dict[str, float]  # potential energy by term and constant
+    system: System
+    state: State  # of the run, whose next steps change it
+    load: Load  # u Å/ps² and u Å²/ps²
+    energies: dict[str, float]  # potential energy by term and constant, u Å²/ps²
+    energy_unit: float  # u Å²/ps²
+    time: float
+    stage: int
+    origin: float | None  # see `observe`
+    extension_sums: np.ndarray | None
+    sums: StateSums
+    ledger: np.ndarray  # (3,) see `State.energy_ledger`
+    potential: float
     kinetic_translation: float
     kinetic_rotation: float
+    kinetic: float
+    energy: float
+    temperature: float
+    temperature_translation: float
+    temperature_rotation: float
+    virial: np.ndarray  # (3, 3) molecular, without the tail correction; an energy
+    pressure_bar: float
     #: (3, 3) molecular, tail correction included, symmetric; NaN without a box
     pressure_tensor_bar: np.ndarray
-    virial: np.ndarray  # (3, 3) molecular, without the tail correction; an energy
-    momentum: np.ndarray  # (3,) u Å/ps
-    load: Load  # u Å/ps² and u Å²/ps²
-    energy_unit: float  # u Å²/ps²
+    edges: list[float]  # of the box, and its angles
+    sample: Sample = field(default_factory=Sample, init=False)
 
     def __getattr__(self, column: str) -> float:
         return getattr(self.sample, column)
 
-    @property
-    def stage_name(self) -> str:
-        return self.sample.stage_name
-
-    @property
-    def user_energies(self) -> tuple[float, ...]:
-        return self.sample.user_energies
-
     def __dir__(self) -> list[str]:
-        return [*object.__dir__(self), *Sample._fields]
+        return [*object.__dir__(self), *vars(self.sample)]
 
     def __repr__(self) -> str:
         energy = self.potential * self.energy_unit / KJ_PER_MOL
         return f"<Observation: potential {energy:.6g} kJ/mol, temperature {self.temperature:.6g} K>"
+
+    @property
+    def stage_name(self) -> str:
+        return self.system.scene.stages[self.stage].label
+
+    @property
+    def conserved(self) -> float:
+        return self.energy - float(self.ledger.sum())
+
+    @property
+    def components(self) -> dict[str, float]:
+        """Potential energy by term and constant."""
+        return {name: energy / self.energy_unit for name, energy in self.energies.items()}
+
+    @property
+    def momentum(self) -> np.ndarray:
+        """Total momentum (3,), u Å/ps."""
+        return self.sums.momentum
 
     @property
     def force(self) -> np.ndarray:
@@ -85,10 +106,9 @@ def observe(
     correction: float = 0.0,
     moved: bool = False,
     energy_unit: float = KJ_PER_MOL,
-    trajectories: tuple[float, ...] = (),
+    extension_sums: np.ndarray | None = None,
 ) -> Observation:
-    """All observables, from one evaluation of forces and energies. This function fills the columns
-    of the log.
+    """All observables, from one evaluation of forces and energies, and the columns of the log.
 
     stage : index of the stage, which may remove momentum from the degrees of freedom of the
         temperatures
@@ -100,7 +120,7 @@ def observe(
     moved : whether the engine has just moved this state, so that it may have its forces and
         energies already
     energy_unit : unit of all energies, u Å²/ps²
-    trajectories : the columns `OF_FEATURES`, if the scene has them
+    extension_sums : see `Engine.extension_sums`, since the last sample
 
     The pressure is the molecular one, (sum m V V + sum F R)/V over centres of mass (Allen &
     Tildesley 2017, 2.7.2), and kB T/V along each axis along which the total momentum is kept at
@@ -108,18 +128,17 @@ def observe(
     The rest is the rate at which orientations gain angular momentum, 0 on average.
     """
     load, tallies = engine.evaluate_current(state) if moved else engine.evaluate(state)
-    components = {name: tally.energy for name, tally in tallies.items()} | system.constants
+    energies = {name: tally.energy for name, tally in tallies.items()} | system.constants
     volume = state.volume
     tail_pressure = 0.0
     if system.tail is not None:
-        components["tail" if system.user_terms else "lennard_jones_tail"] = system.tail.energy(
-            volume
-        )
+        name = "tail" if system.user_terms else "lennard_jones_tail"
+        energies[name] = system.tail.energy(volume)
         tail_pressure = system.tail.pressure(volume)
     virial = sum((tally.virial for tally in tallies.values()), np.zeros((3, 3)))
     sums = engine.sums(state, load) or sums_of_state(system.model, state, load)
     translation, rotation = 0.5 * sums.translation, 0.5 * sums.rotation
-    potential = sum(components.values())
+    potential = sum(energies.values())
     kinetic = translation + rotation
     translation_corrected, rotation_corrected, flux = translation, rotation, sums.momentum_flux
     if correction:  # else squares of forces may exceed the range of numbers
@@ -133,7 +152,7 @@ def observe(
         # a single molecule has no other momentum than the total one
         missing = of_translation if freedom.translation else temperature
         flux = flux + BOLTZMANN * missing * np.diag(at_rest)
-    if boxed := volume < inf:
+    if volume < inf:
         pressure = (flux + (virial + virial.T) / 2) / volume + (
             system.constant_pressure + tail_pressure
         ) * UNIT
@@ -141,54 +160,37 @@ def observe(
     else:
         pressure = np.full((3, 3), nan)
         edges = [nan] * 6
-    tensor_bar = pressure / BAR
-    # not in pilot runs, whose samples are in no log
-    extras = [] if stage is None else system.extras.values()
-    energy = (potential + kinetic) / energy_unit
-    ledger = state.energy_ledger / energy_unit
-    conserved = energy - float(ledger.sum())
-    sample = Sample(
-        step=int(state.step[NOW]),
+    observation = Observation(
+        system,
+        state,
+        load,
+        energies,
+        energy_unit,
         time=float(state.time[NOW]) if time is None else time,
+        stage=stage or 0,
+        origin=origin,
+        extension_sums=extension_sums,
+        sums=sums,
+        ledger=state.energy_ledger / energy_unit,
         potential=potential / energy_unit,
+        kinetic_translation=translation / energy_unit,
+        kinetic_rotation=rotation / energy_unit,
         kinetic=kinetic / energy_unit,
-        energy=energy,
+        energy=(potential + kinetic) / energy_unit,
         temperature=temperature,
-        volume=volume * 1e-3 if boxed else nan,
-        density=system.mass / volume / GRAM_PER_CM3 if boxed else nan,
-        stage_name=system.scene.stages[stage or 0].label,
         temperature_translation=of_translation,
         temperature_rotation=_temperature(rotation_corrected, freedom.rotation),
+        virial=virial / energy_unit,
         pressure_bar=float(pressure.trace()) / (3 * BAR),
-        drift=conserved - (conserved if origin is None else origin),
-        momentum=hypot(*sums.momentum.tolist()),
-        orthogonality_error=sums.orthogonality_error,
-        **dict(zip(EDGES, edges, strict=True)),
-        heat=float(ledger[HEAT]),
-        work=float(ledger[WORK]),
-        **{name: float(tensor_bar[at]) for name, at in COMPONENTS.items()},
-        conserved=conserved,
-        stage=stage or 0,
-        force_squares=sums.force / energy_unit if isfinite(sums.force) else nan,
-        torque_squares=sums.torque / energy_unit if isfinite(sums.torque) else nan,
-        user_energies=(
-            *(components[name] / energy_unit for name in system.user_terms),
-            *(term.distance_in(state) for term in system.distances.values()),
-            *(x / energy_unit for extra in extras for x in extra.values(system, state, potential)),
-            *trajectories,
-        ),
+        pressure_tensor_bar=pressure / BAR,
+        edges=edges,
     )
-    return Observation(
-        sample,
-        {name: energy / energy_unit for name, energy in components.items()},
-        translation / energy_unit,
-        rotation / energy_unit,
-        tensor_bar,
-        virial / energy_unit,
-        sums.momentum,
-        load,
-        energy_unit,
+    # those of pilot runs are in no log
+    quantities = QUANTITIES if stage is None else system.quantities
+    observation.sample = Sample(
+        **{name: quantity.value(observation) for name, quantity in quantities.items()}
     )
+    return observation
 
 
 def kinetic_energies(system: System, state: State) -> tuple[float, float]:

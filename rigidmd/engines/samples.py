@@ -1,151 +1,24 @@
-"""The columns of log.csv, and the samples in a run of molecules.
-
-One table serves files, displays and documentation, the record `Sample`: each field has a `Column`.
-"""
+"""The samples in a run: a table with a column for each quantity."""
 
 from abc import ABC, abstractmethod
 from array import array
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
-from math import nan
-from operator import attrgetter
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, NamedTuple, get_args, get_type_hints
+from types import SimpleNamespace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rigidmd.core.quantities import QUANTITIES, Quantity
 from rigidmd.core.statistics import least_error_from, may_be_unsteady, steady_from
-from rigidmd.features import FEATURES
 
 if TYPE_CHECKING:
     from rigidmd.scene.stage import Stage
 
 
-class Column(NamedTuple):
-    """Header, unit and description of a column."""
-
-    header: str  # in the file of samples; empty for a column that is not written
-    unit: str  # "1" for plain numbers, empty for text
-    about: str
-
-
-class Sample(NamedTuple):
-    """One line of the log, in its units. NaN for what does not exist: pressure without a box, T_rot
-    of points."""
-
-    step: Annotated[int, Column("Step", "1", "steps since the start")]
-    time: Annotated[float, Column("Time (ps)", "ps", "time since the start")]
-    potential: Annotated[
-        float,
-        Column("Potential Energy (kJ/mole)", "kJ/mol", "potential energy of the whole system"),
-    ]
-    kinetic: Annotated[
-        float,
-        Column("Kinetic Energy (kJ/mole)", "kJ/mol", "kinetic energy, translation and rotation"),
-    ]
-    energy: Annotated[
-        float, Column("Total Energy (kJ/mole)", "kJ/mol", "potential and kinetic energy")
-    ]
-    temperature: Annotated[float, Column("Temperature (K)", "K", "temperature of all motion")]
-    volume: Annotated[float, Column("Box Volume (nm^3)", "nm³", "volume of the box")]
-    density: Annotated[float, Column("Density (g/mL)", "g/cm³", "mass density")]
-    stage_name: Annotated[str, Column("Stage", "", "name of the stage")]
-    temperature_translation: Annotated[
-        float, Column("T_trans (K)", "K", "temperature of translation")
-    ]
-    temperature_rotation: Annotated[float, Column("T_rot (K)", "K", "temperature of rotation")]
-    pressure_bar: Annotated[
-        float,
-        Column(
-            "Pressure (bar)",
-            "bar",
-            "molecular pressure, with the tail correction and kB T/V of a total momentum that is"
-            " kept at zero",
-        ),
-    ]
-    drift: Annotated[
-        float, Column("Drift (kJ/mole)", "kJ/mol", "change of `conserved` since the stage began")
-    ]
-    momentum: Annotated[float, Column("Momentum (u A/ps)", "u Å/ps", "size of the total momentum")]
-    orthogonality_error: Annotated[
-        float, Column("Orthogonality error", "1", "largest entry of abs(QᵀQ - 1)")
-    ]
-    a: Annotated[float, Column("a (A)", "Å", "length of the box's edge a")]
-    b: Annotated[float, Column("b (A)", "Å", "length of the box's edge b")]
-    c: Annotated[float, Column("c (A)", "Å", "length of the box's edge c")]
-    alpha: Annotated[float, Column("alpha (deg)", "°", "angle between b and c")]
-    beta: Annotated[float, Column("beta (deg)", "°", "angle between c and a")]
-    gamma: Annotated[float, Column("gamma (deg)", "°", "angle between a and b")]
-    heat: Annotated[
-        float,
-        Column("Heat (kJ/mole)", "kJ/mol", "heat that thermostats have added since the start"),
-    ]
-    work: Annotated[
-        float,
-        Column("Work (kJ/mole)", "kJ/mol", "work of barostats, drives and minimisations so far"),
-    ]
-    pressure_xx: Annotated[
-        float, Column("Pressure xx (bar)", "bar", "molecular pressure tensor, symmetric part")
-    ]
-    pressure_yy: Annotated[float, Column("Pressure yy (bar)", "bar", "the same, yy")]
-    pressure_zz: Annotated[float, Column("Pressure zz (bar)", "bar", "the same, zz")]
-    pressure_xy: Annotated[float, Column("Pressure xy (bar)", "bar", "the same, xy")]
-    pressure_xz: Annotated[float, Column("Pressure xz (bar)", "bar", "the same, xz")]
-    pressure_yz: Annotated[float, Column("Pressure yz (bar)", "bar", "the same, yz")]
-    conserved: Annotated[
-        float, Column("", "kJ/mol", "energy less heat, work and the energy of removed momentum")
-    ]
-    stage: Annotated[int, Column("", "1", "index of the stage, from 0")]
-    force_squares: Annotated[
-        float, Column("F^2/m (kJ/mole/ps^2)", "kJ/mol/ps²", "sum of F²/m of all molecules")
-    ] = nan
-    torque_squares: Annotated[
-        float, Column("n^2/I (kJ/mole/ps^2)", "kJ/mol/ps²", "the same of torques n")
-    ] = nan
-    # in the columns that not all scenes have, see `System.more_columns`
-    user_energies: tuple[float, ...] = ()
-
-
-_HINTS = get_type_hints(Sample, include_extras=True)
-COLUMNS: dict[str, Column] = {
-    name: get_args(_HINTS[name])[1] for name in Sample._fields if name != "user_energies"
-}
-
-
-#: Columns whose means have no meaning.
-NOT_AVERAGED = {
-    "step",
-    "time",
-    "stage_name",
-    "stage",
-    "drift",
-    "momentum",
-    "orthogonality_error",
-    "heat",
-    "work",
-    "conserved",
-    "force_squares",
-    "torque_squares",
-}
-
-
-#: Columns that only scenes with a feature have.
-OF_FEATURES = {name: Column(*words) for row in FEATURES for name, *words in row.columns}
-IN_LOGS = COLUMNS | OF_FEATURES
-
-
-def distance_column(k: int) -> tuple[str, Column]:
-    """Name and column of the distance that fields.restraints.k restrains."""
-    about = f"distance of the groups of fields.restraints.{k}"
-    return f"distance_{k}", Column(f"Distance {k} (A)", "Å", about)
-
-
-def energy_column(name: str) -> Column:
-    """The column of the energy of a user-defined force."""
-    return Column(f"{name} (kJ/mole)", "kJ/mol", f"energy of the force {name}")
-
-
-NUMBERS = [name for name in COLUMNS if name != "stage_name"]
+class Sample(SimpleNamespace):
+    """One line of the log, by the names of its columns, in their units. NaN for what does not
+    exist: pressure without a box, T_rot of points."""
 
 
 #: Key of `results[...]` for rotation matrices (n, 3, 3), where something has one: no column of a
@@ -156,7 +29,7 @@ MATRIX = "Q"
 class SampleTable(ABC):
     """The samples of a run as arrays by the names of their columns, which `described` has."""
 
-    described: dict[str, Column]
+    described: Mapping[str, Quantity]
 
     def __len__(self) -> int:
         return len(self["time"])
@@ -186,32 +59,24 @@ class Samples(SampleTable):
     """The samples of a run in order: a table with one row of float64 per sample.
 
     stages : names of all stages
-    more : further columns, in the order of `Sample.user_energies`
-    table : the result of an earlier `table()`. Raises ValueError if it is invalid.
+    described : the columns
+    table : the result of an earlier `table()`
     """
 
     def __init__(
         self,
         stages: Sequence[str],
-        more: Mapping[str, Column] = MappingProxyType({}),
+        described: Mapping[str, Quantity] = QUANTITIES,
         table: np.ndarray | None = None,
     ):
-        self.stages, self.more = tuple(stages), more
-        self.described = COLUMNS | dict(more)
-        self._numbers = [*NUMBERS, *more]
+        self.stages, self.described = tuple(stages), described
+        self._numbers = numbers(described)
         self._values = array("d")  # grows in place
         if table is not None:
-            if table.ndim != 2 or table.shape[1] != len(self._numbers) or table.dtype != np.float64:
-                raise ValueError(f"samples have the shape {table.shape}")
             self._values.frombytes(table.tobytes())
-            if not np.isin(self._column("stage"), np.arange(len(self.stages))).all():
-                raise ValueError("samples have stages that are not in the scene")
-            step = self._column("step")
-            if not ((np.abs(step) < 2**53) & (np.floor(step) == step)).all():
-                raise ValueError("samples have steps that are not whole numbers")
 
     def append(self, sample: Sample) -> None:
-        self._values.extend((*_VALUES(sample), *sample.user_energies))
+        self._values.extend([getattr(sample, name) for name in self._numbers])
 
     def __len__(self) -> int:
         return len(self._values) // len(self._numbers)
@@ -232,17 +97,11 @@ class Samples(SampleTable):
     def row(self, k: int) -> Sample:
         """Sample k. -1 for the last one."""
         first = range(len(self))[k] * len(self._numbers)
-        width = len(NUMBERS)
-        values = dict(zip(NUMBERS, self._values[first : first + width], strict=True))
-        step, stage = int(values.pop("step")), int(values.pop("stage"))
-        energies = self._values[first + width : first + len(self._numbers)]
-        return Sample(
-            **values,
-            step=step,
-            stage=stage,
-            stage_name=self.stages[stage],
-            user_energies=tuple(energies),
-        )
+        row = self._values[first : first + len(self._numbers)]
+        sample = Sample(**dict(zip(self._numbers, row, strict=True)))
+        sample.step, sample.stage = int(sample.step), int(sample.stage)
+        sample.stage_name = self.stages[sample.stage]
+        return sample
 
     def latest(self, time: float, since: int) -> int:
         """Index of the last sample not later than a time (ps), at least `since`."""
@@ -256,7 +115,7 @@ class Samples(SampleTable):
 
     def of_stage(self, k: int) -> "Samples":
         """The samples of stage k, which are contiguous."""
-        samples = Samples(self.stages, self.more)
+        samples = Samples(self.stages, self.described)
         width = len(self._numbers)
         if len(rows := np.flatnonzero(self._column("stage") == k)):
             samples._values = self._values[rows[0] * width : (rows[-1] + 1) * width]
@@ -272,7 +131,9 @@ class Samples(SampleTable):
         return np.asarray(self._values)[self._numbers.index(name) :: len(self._numbers)]
 
 
-_VALUES = attrgetter(*NUMBERS)
+def numbers(described: Mapping[str, Quantity]) -> list[str]:
+    """The names of the columns that are not text."""
+    return [name for name, quantity in described.items() if quantity.unit]
 
 
 def moving(stages: "Sequence[Stage]", of: np.ndarray) -> np.ndarray:
@@ -304,7 +165,7 @@ def _slow_series(
 def equilibrated(of_stage: Samples, stage: "Stage") -> Samples:
     """The samples of the equilibrated part of a stage."""
     return Samples(
-        of_stage.stages, of_stage.more, of_stage.table()[equilibrated_from(of_stage, stage) :]
+        of_stage.stages, of_stage.described, of_stage.table()[equilibrated_from(of_stage, stage) :]
     )
 
 

@@ -8,11 +8,16 @@ from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 import numpy as np
 
+from rigidmd.core.quantities import (
+    QUANTITIES,
+    Quantity,
+    energy_of_force,
+    restrained_distance,
+)
 from rigidmd.core.state import State
-from rigidmd.core.state_file import SavedState, array_errors
+from rigidmd.core.state_file import SavedState, errors_of_arrays
 from rigidmd.dynamics.model import DegreesOfFreedom, Model, mobile
 from rigidmd.engines.cpu.engine import CpuEngine, Precision
-from rigidmd.engines.samples import OF_FEATURES, Column, distance_column, energy_column
 from rigidmd.engines.sites import Sites
 from rigidmd.forces.fields.distances import DistanceRestraint
 from rigidmd.forces.neighbors.pair_loop import PairForces
@@ -56,11 +61,7 @@ class Extra:
     #: Name of a term in place of one of the core -> what it is, for messages
     titles: Mapping[str, str] = field(default_factory=dict)
     #: Columns of the log
-    columns: Mapping[str, Column] = field(default_factory=dict)
-
-    def values(self, system: "System", state: State, potential: float) -> list[float]:
-        """Values of `columns`, u Å²/ps², of a state with a potential energy."""
-        return []
+    quantities: tuple[Quantity, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -176,24 +177,18 @@ class System:
         barostat. A field is among them only if a molecule has a net charge."""
         return [name for name, term in self.terms.items() if trait(term, "tied_to_places")]
 
-    @property
-    def distances(self) -> dict[str, DistanceRestraint]:
-        """The terms that restrain distances, by name."""
-        return {
-            name: term for name, term in self.terms.items() if isinstance(term, DistanceRestraint)
-        }
-
-    @property
-    def more_columns(self) -> dict[str, Column]:
-        """The columns of this scene that not all scenes have, in the order of
-        `Sample.user_energies`."""
-        columns = {name: energy_column(name) for name in self.user_terms}
-        columns |= dict(distance_column(int(name.rpartition("_")[2])) for name in self.distances)
-        for extra in self.extras.values():
-            columns |= extra.columns
-        for stage in self.scene.stages:
-            columns |= {name: OF_FEATURES[name] for name in stage.thermostat_method.columns}
-        return columns
+    @cached_property
+    def quantities(self) -> dict[str, Quantity]:
+        """The columns of the samples of this scene."""
+        rows = [*QUANTITIES.values(), *map(energy_of_force, self.user_terms)]
+        rows += [
+            restrained_distance(name.rpartition("_")[2], term.observed_distance)
+            for name, term in self.terms.items()
+            if isinstance(term, DistanceRestraint)
+        ]
+        rows += [row for extra in self.extras.values() for row in extra.quantities]
+        rows += [row for stage in self.scene.stages for row in stage.thermostat_method.quantities]
+        return {row.name: row for row in rows}
 
     @property
     def removes_momentum_every(self) -> float | None:
@@ -259,15 +254,10 @@ class System:
     def state_errors(self, state: State) -> list[str]:
         """Messages on positions, momenta and cell of a state from outside which this system cannot
         have."""
-        names = State._fields[:5]
-        if masked := [name for name in names if np.ma.is_masked(getattr(state, name))]:
-            return [f"{name} of the state has masked values, not numbers" for name in masked]
-        arrays = {name: np.asarray(getattr(state, name)) for name in names}
-        shapes = {name: getattr(self.state, name).shape for name in names}
-        if problems := array_errors(arrays, shapes):
-            about = f"the scene has {len(self.state.position)} molecules"
-            return [f"{name} of the state {problem}; {about}" for name, problem in problems.items()]
-        cell = arrays["cell"]
+        about = f"the scene has {len(self.state.position)} molecules"
+        if errors := errors_of_arrays(state, self.state, about):
+            return errors
+        cell = np.asarray(state.cell)
         if np.isfinite(cell).all() != np.isfinite(self.state.cell).all():
             return ["one of scene and state has a periodic box, and the other has none"]
         half = min(space_of(cell).edges) / 2

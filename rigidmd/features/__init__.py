@@ -4,8 +4,6 @@ from collections.abc import Iterator, Mapping
 
 from rigidmd.feature import Feature, Row
 
-_ENDED = "the trajectories of hybrid Monte Carlo since the line before"
-
 FEATURES = (
     Row(
         "bodies",
@@ -67,21 +65,6 @@ FEATURES = (
         "hybrid Monte Carlo",
         keys=("stages.thermostat=hybrid_monte_carlo",),
         thermostats=("keys",),
-        columns=(
-            ("acceptance", "Acceptance", "1", f"fraction of {_ENDED} that was accepted"),
-            (
-                "abs_dH_kT",
-                "abs(dH) (kT)",
-                "kT",
-                f"mean size of the change of the energy in {_ENDED}",
-            ),
-            (
-                "exp_minus_dH",
-                "exp(-dH/kT)",
-                "1",
-                f"mean over {_ENDED}. In equilibrium 1 on average",
-            ),
-        ),
     ),
     Row("calculators", "ASE calculators, both ways", needs=("potentials",)),
     Row(

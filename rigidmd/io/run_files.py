@@ -9,10 +9,9 @@ OpenMM's StateDataReporter.
 import csv
 import io
 import time as clock
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from math import inf
-from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, NamedTuple, TextIO, TypeVar
 
@@ -20,9 +19,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from rigidmd.core.files import AppendedFile, unreadable_reason, writing
+from rigidmd.core.quantities import QUANTITIES, Quantity
 from rigidmd.core.toml import shorten_repr
-from rigidmd.engines import samples
-from rigidmd.engines.samples import Column, Sample
+from rigidmd.engines.samples import Sample
 from rigidmd.errors import OutputError
 from rigidmd.io.folder import check_inside
 from rigidmd.scene.validation import Flag, Number, validation_messages
@@ -40,55 +39,33 @@ Bounded = Annotated[Number, Field(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]
 
 
 class StageSummary(BaseModel):
-    """The part of a stage in summary.json that is read."""
+    """The values of a stage in summary.json that are read. Pages compute the others again."""
 
     model_config = ConfigDict(extra="allow")
 
     name: str
-    integrator: str | None = None
+    choice: str | None = None
     timestep_fs: Bounded | None = None
     stable_timestep_fs: Bounded | None = None
-    drift_kJ_mol_ns_per_molecule: Bounded | None = None
-    drift_error_kJ_mol_ns_per_molecule: Bounded | None = None
+    computing_s: Bounded = 0.0
+    moves_tried: int = 0
+    moves_accepted: int = 0
     drift_kT_ns_per_degree_of_freedom: Bounded | None = None
     drift_error_kT_ns_per_degree_of_freedom: Bounded | None = None
-    drift_verdict: str | None = None
-    energy_rms_kJ_mol_per_molecule: Bounded | None = None
-    ns_per_day: Bounded | None = None
-
-
-class RateSummary(BaseModel):
-    """A rate of the motion of a body in summary.json."""
-
-    measured: Bounded | None = None
-    theory: Bounded | None = None
 
 
 class Summary(BaseModel):
-    """The part of summary.json that is read, for molecules and bodies, by any version."""
+    """The part of summary.json that is read and not only shown, for molecules and bodies, by any
+    version."""
 
     model_config = ConfigDict(extra="allow")
 
     interrupted: Flag = False
     notes: list[str] = []
     stages: list[StageSummary] = []
-    rates: dict[str, RateSummary] = {}
     scene_sha256: str | None = None
     input_sha256: dict[str, str] = {}
     processor_features: list[str] = []
-    threads: int | None = None
-    vector_bits: int | None = None
-    seed: int | None = None
-    precision: str | None = None
-    machine: str | None = None
-    processor: str | None = None
-    rigidmd_version: str | None = None
-    numba_version: str | None = None
-    llvmlite_version: str | None = None
-    numpy_version: str | None = None
-    scipy_version: str | None = None
-    rocket_fft_version: str | None = None
-    python_version: str | None = None
     preparing_s: Bounded | None = None
     computing_s: Bounded | None = None
     wall_s: Bounded | None = None
@@ -179,45 +156,35 @@ def _lines(file: TextIO) -> Iterator[str]:
 #: Seconds that a line waits for others, which together take a tenth of the time. Lines at longer
 #: intervals do not wait.
 DELAY, SELDOM = 0.5, 0.05
-#: Columns of log.csv that are written on request.
-TENSOR = tuple(
-    name
-    for name in samples.COLUMNS
-    if name.startswith("pressure_") and len(name) == len("pressure_xx")
-)
 
 
-def columns(tensor: bool = True, more: Mapping[str, Column] | None = None) -> dict[str, str]:
-    """Name of each column -> its header, with or without the pressure tensor. more : see
-    `Samples`"""
-    described = samples.COLUMNS | dict(more or {})
-    written = {name: column.header for name, column in described.items() if column.header}
-    if tensor:
-        return written
-    return {name: header for name, header in written.items() if name not in TENSOR}
+def columns(
+    described: Mapping[str, Quantity] = QUANTITIES, *, tensor: bool = True
+) -> dict[str, str]:
+    """Name of each column of log.csv -> its header, with or without the pressure tensor."""
+    return {
+        name: quantity.header
+        for name, quantity in described.items()
+        if quantity.header and (tensor or not quantity.of_tensor)
+    }
+
+
+def row_of(sample: Sample, names: Iterable[str]) -> list:
+    """The values of columns in a line of a file."""
+    return [round(sample.time, 9) if name == "time" else getattr(sample, name) for name in names]
 
 
 class Log(AppendedFile):
-    """Writes samples to log.csv, numbers with all significant digits, missing values empty. Raises
+    """Writes samples to a file, numbers with all significant digits, missing values empty. Raises
     OutputError.
 
     kept : earlier value of the property `kept`, from which the file is continued. None begins a new
         file
-    tensor, more : see `columns`
+    columns : name -> header, see `columns`
     """
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        tensor: bool,
-        kept: Sequence[int] | None = None,
-        more: Mapping[str, Column] | None = None,
-    ):
-        self._columns = columns(tensor, more)
-        shared = [name for name in self._columns if name not in (more or {})]
-        self._values = attrgetter(*shared)
-        self._time = shared.index("time")
+    def __init__(self, path: Path, columns: dict[str, str], kept: Sequence[int] | None = None):
+        self._columns = columns
         self._rows: list[list] = []
         self._written = self._came = -inf
         super().__init__(path, kept)
@@ -233,9 +200,7 @@ class Log(AppendedFile):
 
     def write(self, sample: Sample) -> None:
         """Add a line. It is written at once unless another one came shortly before."""
-        row = [*self._values(sample), *sample.user_energies]
-        row[self._time] = round(sample.time, 9)
-        self._rows.append(row)
+        self._rows.append(row_of(sample, self._columns))
         now = clock.monotonic()
         before, self._came = self._came, now
         if now - before >= SELDOM or now - self._written >= DELAY:
@@ -261,32 +226,17 @@ class Log(AppendedFile):
 
 
 TENSOR_FILE = "pressure_tensor.csv"
-HEADER = [samples.COLUMNS[name].header for name in ("time", *TENSOR)]
-
-
-def tensor_row(sample: Sample) -> list[float]:
-    """A line of pressure_tensor.csv: time (ps) and the six components of the tensor, bar."""
-    return [round(sample.time, 9), *(getattr(sample, name) for name in TENSOR)]
-
-
-class TensorFile(AppendedFile):
-    """Writes pressure_tensor.csv, for viscosities. See `Log` for `kept`. Raises OutputError."""
-
-    def __init__(self, path: Path, kept: Sequence[int] | None = None):
-        super().__init__(path, kept)
-        if kept is None:
-            self.append((",".join(f'"{title}"' for title in HEADER) + "\n").encode())
-
-    def write(self, row: list[float]) -> None:
-        self.append((",".join(map(repr, row)) + "\n").encode())
+#: Its columns: name -> header.
+TENSOR = {name: row.header for name, row in QUANTITIES.items() if name == "time" or row.of_tensor}
 
 
 def read_tensor(path: Path) -> np.ndarray | None:
     """Complete lines (n, 7) of pressure_tensor.csv. None without a file. Raises OutputError."""
     if (columns_read := read_columns(path)) is None:
         return None
-    if list(columns_read.cells) != HEADER:
+    headers = list(TENSOR.values())
+    if list(columns_read.cells) != headers:
         raise OutputError(
-            f"{path} is not a pressure tensor of rigidmd: its columns must be {', '.join(HEADER)}"
+            f"{path} is not a pressure tensor of rigidmd: its columns must be {', '.join(headers)}"
         )
-    return np.array([columns_read.numbers(header, finite=True) for header in HEADER]).T
+    return np.array([columns_read.numbers(header, finite=True) for header in headers]).T

@@ -1,6 +1,6 @@
 """Runs of molecules: removal of overlaps, stages of all ensembles, samples."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
@@ -22,7 +22,7 @@ from rigidmd.dynamics.model import remove_momentum
 from rigidmd.dynamics.observables import largest_values
 from rigidmd.engines.observables import Observation, describe_quantities, observe
 from rigidmd.engines.protocol import Engine, NotFiniteError
-from rigidmd.engines.samples import OF_FEATURES, Samples
+from rigidmd.engines.samples import Samples
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, SimulationError, StructureError
 from rigidmd.features import acting_on, used_by
@@ -30,6 +30,7 @@ from rigidmd.formats import format_of
 from rigidmd.formats.through_ase import atoms_of_system
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.progress import progress_of
+from rigidmd.io.run_files import columns
 from rigidmd.io.scene_file import input_names
 from rigidmd.run import checks
 from rigidmd.run.force_errors import coulomb_errors
@@ -44,10 +45,9 @@ from rigidmd.run.minimise import (
 from rigidmd.run.molecular_observers import FinalState, LogFile, PressureTensor, Sampler, StepWatch
 from rigidmd.run.observers import Frames, Moment, Observer, SceneFile
 from rigidmd.run.part import RunPart
-from rigidmd.run.report import summary_text
+from rigidmd.run.report import short_summary, summary_text
 from rigidmd.run.resume import Count, RunRecord, check_same_scene, plain, state_from
 from rigidmd.run.schedule import Segment, interruptible
-from rigidmd.run.short_report import short_summary
 from rigidmd.run.stable_step import DIRECTIONS, SMALL_SYSTEM, stiffest_mode
 from rigidmd.run.summary import Minimum, describe_minimum, summarise
 from rigidmd.scene import MolecularScene
@@ -86,7 +86,6 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
     """The part of a simulation of molecules."""
 
     record_type = MolecularRecord
-    summary_text, short_summary = staticmethod(summary_text), staticmethod(short_summary)
 
     def __init__(
         self,
@@ -453,16 +452,10 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             correction = self._integrator(moment.stage).kinetic_correction * step**2
         # an external engine may not report the heat of its thermostat
         conserves = not stage.is_minimisation and self.engine.conserves_energy
-        trajectories = tuple(nan for name in self.system.more_columns if name in OF_FEATURES)
-        if (sums := self.engine.extension_sums) is not None:
-            samples = self._sampler.samples
-            of_stage = len(samples) > 0 and samples.row(-1).stage == moment.stage
-            ended, accepted, sizes, _, weights = (
-                sums - of_stage * self._sampler.trajectories
-            ).tolist()
-            trajectories = (
-                (accepted / ended, sizes / ended, weights / ended) if ended else trajectories
-            )
+        sums = self.engine.extension_sums
+        samples = self._sampler.samples
+        if sums is not None and len(samples) and samples.row(-1).stage == moment.stage:
+            sums -= self._sampler.trajectories
         return observe(
             self.system,
             self.engine,
@@ -470,7 +463,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             moment.stage,
             time=moment.time,
             moved=True,
-            trajectories=trajectories,
+            extension_sums=sums,
             origin=self._sampler.origin(moment.stage) if conserves else nan,
             correction=correction,
         )
@@ -519,7 +512,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             files = [
                 SceneFile(names.values()),
                 *files,
-                LogFile(interval, tensor=output.pressure_tensor),
+                LogFile(interval, columns(self.system.quantities, tensor=output.pressure_tensor)),
                 FinalState(),
             ]
             for row in used_by(self.scene):
@@ -540,6 +533,10 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             wall,
             interrupted=self.simulation._is_interrupted,
         )
+
+    def summary_text(self, summary: Json, known: Container[str], *, is_short: bool) -> str:
+        text_of = short_summary if is_short else summary_text
+        return text_of(summary, known, self.system.quantities)
 
     def explain(self, error: SimulationError) -> str:
         stable = self.record.stable.get(self.record.position.segment)

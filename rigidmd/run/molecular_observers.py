@@ -12,7 +12,7 @@ from rigidmd.engines.samples import Samples
 from rigidmd.features import acting_on
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import FINAL, LAST_GOOD, LOG
-from rigidmd.io.run_files import TENSOR_FILE, Log, TensorFile, tensor_row
+from rigidmd.io.run_files import TENSOR, TENSOR_FILE, Log, row_of
 from rigidmd.run import checks
 from rigidmd.run.observers import GrowingFile, Moment, Observer
 from rigidmd.scene.stage import Stage
@@ -30,47 +30,45 @@ class LogFile(GrowingFile[Log]):
     ends = reads_energies = True
     _names = (LOG,)
 
-    def __init__(self, interval: float, *, tensor: bool):
-        self.interval, self._tensor = interval, tensor
+    def __init__(self, interval: float, columns: dict[str, str]):
+        self.interval, self._columns = interval, columns
 
     def begin(self, run: "Simulation") -> None:
-        self._file = Log(
-            run.path(LOG), tensor=self._tensor, kept=self.kept, more=run.system.more_columns
-        )
+        self._file = Log(run.path(self._names[0]), self._columns, self.kept)
 
     def see(self, moment: Moment) -> None:
         not_none(self._file).write(moment.sample)
 
     def end(self, run: "Simulation", results: "Results") -> None:
         not_none(self._file).flush()
-        results.files.append(run.path(LOG))
+        results.files.append(run.path(self._names[0]))
 
 
-class PressureTensor(GrowingFile[TensorFile]):
+class PressureTensor(LogFile):
     """pressure_tensor.csv: the pressure tensor at its own interval. Without a folder in memory."""
 
-    once = reads_energies = True
+    ends, once = False, True
     _names = (TENSOR_FILE,)
 
     def __init__(self, interval: float):
-        self.interval = interval
+        super().__init__(interval, TENSOR)
         self._rows: list[list[float]] = []
 
     def begin(self, run: "Simulation") -> None:
-        self._file = None if run.folder is None else TensorFile(run.path(TENSOR_FILE), self.kept)
+        if run.folder is not None:
+            super().begin(run)
 
     def see(self, moment: Moment) -> None:
-        row = tensor_row(moment.sample)
         if self._file is None:
-            self._rows.append(row)
+            self._rows.append(row_of(moment.sample, TENSOR))
         else:
-            self._file.write(row)
+            super().see(moment)
 
     def end(self, run: "Simulation", results: "Results") -> None:
         if self._file is None:
             results._tensor = np.array(self._rows)
         else:
-            results.files.append(run.path(TENSOR_FILE))
+            super().end(run, results)
 
 
 def _check_next_step(run: "Simulation", check: checks.StepCheck, load: Load, stage: Stage) -> None:
@@ -93,7 +91,7 @@ class Sampler(Observer):
 
     def __init__(self, run: "Simulation", interval: float, check: checks.StepCheck):
         self.interval = interval
-        self.samples = Samples([stage.label for stage in run.scene.stages], run.system.more_columns)
+        self.samples = Samples([stage.label for stage in run.scene.stages], run.system.quantities)
         self.last_good: State | None = None
         self._run, self._check = run, check
         self._warns = acting_on(run.scene)  # each once
@@ -140,7 +138,7 @@ class Sampler(Observer):
 
     @table.setter
     def table(self, table: np.ndarray) -> None:
-        self.samples = Samples(self.samples.stages, self.samples.more, table)
+        self.samples = Samples(self.samples.stages, self.samples.described, table)
 
     def resume(self, run: "Simulation", kept: Checkpoint) -> None:
         """Restore the samples. The state of the checkpoint is the last good one."""

@@ -125,15 +125,9 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
         wall : seconds of the run, with observers and output
         """
 
-    @staticmethod
     @abstractmethod
-    def summary_text(summary: Json, known: Container[str]) -> str:
-        """The summary as text, without the notes in `known`."""
-
-    @staticmethod
-    @abstractmethod
-    def short_summary(summary: Json, known: Container[str]) -> str:
-        """The main results as text, without the notes in `known`."""
+    def summary_text(self, summary: Json, known: Container[str], *, is_short: bool) -> str:
+        """The summary as text, without the notes in `known`, or its main results."""
 
     @abstractmethod
     def explain(self, error: SimulationError) -> str:

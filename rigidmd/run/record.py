@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 
+from rigidmd.core.quantities import energy_of_force
 from rigidmd.core.toml import Json
 from rigidmd.engines import samples
 from rigidmd.errors import OutputError
@@ -47,18 +48,14 @@ class Record(Generic[SystemT]):
     @property
     def log(self: "Record[System]") -> samples.Samples:
         """The samples of a run of molecules. NaN in columns that log.csv does not have."""
-        more = self.system.more_columns
+        described = self.system.quantities
         # energies of user-defined forces, which the system is read without
-        known = {*samples.IN_LOGS, *more}
-        users = (name for name in self.columns if name not in known)
-        columns = {name: samples.energy_column(name) for name in users} | more
+        users = [name for name in self.columns if name not in described]
+        described = described | {name: energy_of_force(name) for name in users}
         unknown = np.full(len(self.time), np.nan)
-        table = np.column_stack(
-            [self.columns.get(name, unknown) for name in (*samples.NUMBERS, *columns)]
-        )
-        return samples.Samples(
-            [stage.label for stage in self.system.scene.stages], columns, table.astype(float)
-        )
+        table = [self.columns.get(name, unknown) for name in samples.numbers(described)]
+        labels = [stage.label for stage in self.system.scene.stages]
+        return samples.Samples(labels, described, np.column_stack(table).astype(float))
 
     @property
     def trajectory(self) -> Path:

@@ -117,12 +117,11 @@ class Results(Displayed):
             import pandas
         except ImportError:
             raise ImportError("to_dataframe() needs pandas: pip install pandas") from None
-        from rigidmd.io.run_files import TENSOR
+        from rigidmd.io.run_files import columns
 
-        left_out = () if getattr(self.system.scene.output, "pressure_tensor", True) else TENSOR
-        return pandas.DataFrame(self.samples.written).drop(
-            columns=[self.samples.described[n].header for n in left_out]
-        )
+        tensor = getattr(self.system.scene.output, "pressure_tensor", True)
+        headers = columns(self.samples.described, tensor=tensor)
+        return pandas.DataFrame({header: self[name] for name, header in headers.items()})
 
     def universe(self) -> "MDAnalysis.Universe":
         """The trajectory as an MDAnalysis Universe, from the files if there are any, or else from

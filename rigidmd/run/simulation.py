@@ -322,8 +322,8 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
     def _conclusion(self, results: Results, *, verbose: bool = False) -> str:
         """The summary as text, without the notes of the introduction and the warnings that were
         issued."""
-        text_of = self._part.summary_text if verbose else self._part.short_summary
-        return text_of(results.summary, [*self._part.system.notes, *self._issued])
+        known = [*self._part.system.notes, *self._issued]
+        return self._part.summary_text(results.summary, known, is_short=not verbose)
 
     def _write_scene(self, folder: Path) -> None:
         """Write the scene as it runs, with copies of the files that it reads."""

@@ -5,15 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.engines import samples
+from rigidmd.core.quantities import energy_of_force
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError
 from rigidmd.io.folder import LOG
-from rigidmd.io.run_files import read_columns
+from rigidmd.io.run_files import columns, read_columns
 from rigidmd.scene.stage import Stage
-
-#: Header of a column of log.csv -> its name.
-HEADERS = {column.header: name for name, column in samples.IN_LOGS.items() if column.header}
 
 
 def read_log(folder: Path, system: System) -> dict[str, np.ndarray]:
@@ -21,25 +18,24 @@ def read_log(folder: Path, system: System) -> dict[str, np.ndarray]:
     read = read_columns(folder / LOG)
     if read is None:
         raise OutputError(f"{folder / LOG} cannot be read: there is no such file")
-    known = HEADERS | {column.header: name for name, column in system.more_columns.items()}
-    unit = samples.energy_column("").header
+    known = {header: name for name, header in columns(system.quantities).items()}
+    unit = energy_of_force("").header
     headers = {
         known.get(header) or header.removesuffix(unit): header
         for header in read.cells
         if header in known or header.endswith(unit)
     }
     if lacking := [name for name in ("step", "time", "stage_name") if name not in headers]:
-        header = samples.COLUMNS[lacking[0]].header
+        header = system.quantities[lacking[0]].header
         raise OutputError(f"{read.path} is not a log of rigidmd: it has no column {header!r}")
-    columns = {
+    arrays = {
         name: np.array(read.cells[header])
         if name == "stage_name"
         else read.numbers(header, finite=name == "time")
         for name, header in headers.items()
     }
-    return columns | {
-        "stage": _stage_of(columns["stage_name"], columns["time"], system.scene.stages)
-    }
+    stage = _stage_of(arrays["stage_name"], arrays["time"], system.scene.stages)
+    return arrays | {"stage": stage}
 
 
 def _stage_of(names: np.ndarray, time: np.ndarray, stages: Sequence[Stage]) -> np.ndarray:

@@ -1,17 +1,17 @@
 """The summary of a run of molecules: one dictionary with units in its keys, and its notes."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable
 from math import hypot, isnan, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from rigidmd.core.quantities import QUANTITIES, Mean, Quantity, with_means
 from rigidmd.core.state import REMOVED, State
 from rigidmd.core.statistics import ENERGY_ERROR, format_with_error, mean_and_error, slope
 from rigidmd.core.toml import Json
 from rigidmd.engines.samples import (
-    COLUMNS,
     LEAST_SAMPLES,
     Sample,
     Samples,
@@ -25,9 +25,6 @@ from rigidmd.units import BAR, BOLTZMANN, COULOMB, FEMTOSECOND, KJ_PER_MOL
 if TYPE_CHECKING:
     from rigidmd.run.molecular import MolecularRecord
 
-#: Columns of which stages have means -> the units in the keys.
-TEMPERATURES = {name: "K" for name in COLUMNS if name.startswith("temperature")}
-BOX = {"density": "g_cm3", "a": "A", "b": "A", "c": "A"}
 #: The second half of a stage has notes if it has enough samples, on effects larger than some
 #: standard errors. A drift is significant from there on: in random walks of the energy its errors
 #: are up to 1.5 times too small (`slope`).
@@ -391,14 +388,11 @@ def stage_summary(
         line = slope(np.append(first.time, time), np.append(0.0, drift))
     else:
         line = slope(time, drift)
-    temperatures = _means(steady, TEMPERATURES)
-    potential = mean_and_error(steady["potential"] / n)
-    pressure = mean_and_error(steady["pressure_bar"])
+    rows = [row for row in with_means(samples.described) if row[0].is_averaged]
+    means = _means(steady, [row for row in rows if stage.has_barostat or not row[0].of_box], n)
     spread = float(of_stage["kinetic"].std())
     duration = steps * stage.step
-    thermal = (
-        BOLTZMANN / KJ_PER_MOL * (temperatures["temperature_K"] or 0.0) * system.freedom_in(k).total
-    )
+    thermal = BOLTZMANN / KJ_PER_MOL * (means["temperature_K"] or 0.0) * system.freedom_in(k).total
     per_kt = [_finite_or_none(rate * 1000 / thermal) if thermal > 0 else None for rate in line[:2]]
     values = {
         "name": stage.label,
@@ -414,12 +408,7 @@ def stage_summary(
         "equilibrated_from_ps": begin if len(time) >= LEAST_SAMPLES else None,
         "set_temperature_K": stage.temperature_K,
         "set_pressure_bar": stage.pressure_bar,
-        **temperatures,
-        "potential_kJ_mol_per_molecule": potential[0],
-        "potential_error_kJ_mol_per_molecule": potential[1],
-        "pressure_bar": pressure[0],
-        "pressure_error_bar": pressure[1],
-        **(_means(steady, BOX) if stage.has_barostat else {}),
+        **means,
         "moves_tried": moves[0],
         "moves_accepted": moves[1],
         "drift_verdict": (
@@ -453,12 +442,11 @@ def stage_summary(
         square = 2 * level.mean() ** 2 / freedom - level.var() if freedom else 0.0
         values["temperature_scatter_K"] = sqrt(square) if square > 0 else None
     if stage.in_trajectories:
-        values |= {"trajectories": steps // stage.steps_together}
-        values |= _means(steady, dict.fromkeys(stage.thermostat_method.columns, "mean"))
+        values["trajectories"] = steps // stage.steps_together
     if stage.volume:
-        values |= _means(equilibrated(before, earlier), {"volume": "nm3"}) | {
-            "volume_before_nm3": first.volume
-        }
+        mean = mean_and_error(equilibrated(before, earlier)["volume"])
+        values["volume_nm3"], values["volume_error_nm3"] = mean
+        values["volume_before_nm3"] = first.volume
     return values
 
 
@@ -468,7 +456,8 @@ def _minimised(
     """Values of a minimisation, at its end. None for those that only a stage of motion has."""
     stage = system.scene.stages[k]
     minimum_values = minimum_figures(minimum, len(system.model.species))
-    end = Samples(samples.stages, samples.more, samples.of_stage(k).table()[-1:])
+    end = Samples(samples.stages, samples.described, samples.of_stage(k).table()[-1:])
+    of_box = [row for row in with_means() if row[0].of_box and stage.changes_box]
     return dict.fromkeys(stage_summary(system, samples, k, computing, (0, 0))) | {
         "name": stage.label,
         "ensemble": stage.ensemble,
@@ -477,21 +466,26 @@ def _minimised(
         "computing_s": computing,
         "potential_kJ_mol_per_molecule": minimum_values["energy_after_kJ_mol_per_molecule"],
         "pressure_bar": minimum_values["pressure_bar"],
-        **(_means(end, BOX) if stage.changes_box else {}),
+        **_means(end, of_box),
         "moves_tried": 0,
         "moves_accepted": 0,
         "minimum": minimum_values,
     }
 
 
-def _means(samples: Samples, columns: Mapping[str, str]) -> dict[str, float | None]:
-    """Means of columns, and their errors. The columns have the units of their keys."""
+def _means(
+    samples: Samples, rows: Iterable[tuple[Quantity, Mean]], molecules: int = 1
+) -> dict[str, float | None]:
+    """Means and their errors. Those of features where they have values."""
     means = {}
-    for name, unit in columns.items():
-        values = samples[name]  # no trajectory has ended at the first sample
-        means[f"{name}_{unit}"], means[f"{name}_error_{unit}"] = mean_and_error(
-            values[np.isfinite(values)]
-        )
+    for quantity, mean in rows:
+        values = samples[quantity.name]
+        values = values[np.isfinite(values)]  # no trajectory has ended at the first sample
+        if len(values) or quantity.name in QUANTITIES:
+            divisor = molecules if mean.per_molecule else 1
+            means[mean.key.format("")], means[mean.key.format("_error")] = mean_and_error(
+                values / divisor
+            )
     return means
 
 

@@ -5,6 +5,7 @@ import re
 from typing import Literal, Protocol, get_args
 
 from rigidmd.core.integrators import Scheme
+from rigidmd.core.quantities import Quantity
 from rigidmd.scene.validation import Section
 
 Values = dict[str, float]  # of keys
@@ -92,8 +93,8 @@ class Thermostat(EnsembleMethod):
     #: Module whose `choose_for_stage` chooses integrator and step for integrator = "auto". Empty:
     #: they follow from the error that is set.
     pilot: str = ""
-    #: Columns of the log that only its stages have, see `features.FEATURES`.
-    columns: tuple[str, ...] = ()
+    #: Columns of the log that only its stages have.
+    quantities: tuple[Quantity, ...] = ()
 
     @property
     def in_trajectories(self) -> bool:

@@ -3,28 +3,30 @@
 import tracemalloc
 
 import numpy as np
-import pytest
 
-from rigidmd.engines.samples import COLUMNS, Sample, Samples, energy_column
+from rigidmd.core.quantities import QUANTITIES, energy_of_force
+from rigidmd.engines.samples import Sample, Samples
 
 
-def a_sample(k: int, own: tuple[float, ...] = ()) -> Sample:
-    values = {name: k + column / 64 for column, name in enumerate(COLUMNS)}
-    return Sample(
-        **values | {"step": k, "time": k / 4, "stage": k // 5, "stage_name": "ab"[k // 5]},
-        user_energies=own,
-    )
+def a_sample(k: int, **energies: float) -> Sample:
+    values = {name: k + column / 64 for column, name in enumerate(QUANTITIES)}
+    values |= {"step": k, "time": k / 4, "stage": k // 5, "stage_name": "ab"[k // 5]}
+    return Sample(**values, **energies)
+
+
+def with_forces(*names: str) -> dict:
+    return QUANTITIES | {name: energy_of_force(name) for name in names}
 
 
 def test_samples_give_back_what_was_added():
-    samples = Samples(["a", "b"], {name: energy_column(name) for name in ("spring", "field")})
+    samples = Samples(["a", "b"], with_forces("spring", "field"))
     assert len(samples["time"]) == 0
-    added = [a_sample(k, (k / 3, -k)) for k in range(10)]
+    added = [a_sample(k, spring=k / 3, field=-k) for k in range(10)]
     for sample in added:
         samples.append(sample)
-    assert samples.rows == list(Samples(["a", "b"], samples.more, samples.table())) == added
+    assert samples.rows == list(Samples(["a", "b"], samples.described, samples.table())) == added
     assert samples.row(-1) == added[-1]
-    for name in COLUMNS:
+    for name in QUANTITIES:
         assert samples[name].tolist() == [getattr(sample, name) for sample in added]
     assert samples["field"].tolist() == [0, -1, -2, -3, -4, -5, -6, -7, -8, -9]
     assert samples.of_stage(1).rows == added[5:]
@@ -35,37 +37,15 @@ def test_samples_give_back_what_was_added():
                 [k for k in range(since, 10) if k / 4 <= moment], default=since
             )
     column = samples["time"]
-    samples.append(a_sample(9, (0.0, 0.0)))  # columns are copies
+    samples.append(a_sample(9, spring=0.0, field=0.0))  # columns are copies
     assert len(column) == 10
 
 
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        (lambda table: table[:, 1:], "shape"),
-        (lambda table: table.ravel(), "shape"),
-        (lambda table: np.where(table == 1.0, 7.0, table), "have stages that are not in the scene"),
-        (
-            lambda table: np.where(table == 1.0, np.nan, table),
-            "have stages that are not in the scene",
-        ),
-        (lambda table: np.where(table == 6.0, 6.5, table), "steps that are not whole numbers"),
-        (lambda table: np.where(table == 6.0, 1e300, table), "steps that are not whole numbers"),
-        (lambda table: np.where(table == 6.0, np.inf, table), "steps that are not whole numbers"),
-    ],
-)
-def test_rows_that_are_not_samples_are_refused(change, expected):
-    samples = Samples(["a", "b"])
-    samples.append(a_sample(6))
-    with pytest.raises(ValueError, match=expected):
-        Samples(["a", "b"], {}, change(samples.table()))
-
-
 def test_a_sample_takes_no_more_than_its_numbers():
-    samples = Samples(["a", "b"], {"spring": energy_column("spring")})
+    samples = Samples(["a", "b"], with_forces("spring"))
     tracemalloc.start()
     for k in range(5000):
-        samples.append(a_sample(k % 10, (0.0,)))
+        samples.append(a_sample(k % 10, spring=0.0))
     size, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert size < 5000 * 1.2 * 8 * len(COLUMNS)
+    assert size < 5000 * 1.2 * 8 * len(QUANTITIES)

@@ -16,8 +16,9 @@ from support.stops import contents, everything, stopped_at, top
 
 from rigidmd.assemble.build import build
 from rigidmd.commands import cli
+from rigidmd.core.quantities import QUANTITIES
 from rigidmd.core.state import State
-from rigidmd.engines.samples import NUMBERS
+from rigidmd.engines.samples import numbers
 from rigidmd.errors import CheckpointError, OutputError, SimulationError
 from rigidmd.io import checkpoint
 from rigidmd.io.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
@@ -274,7 +275,7 @@ def test_a_folder_without_a_checkpoint(again, printed):
 
 def test_a_checkpoint_of_other_columns_has_another_schema():
     """The table of samples has no names: a change of the columns needs a new number here and there."""
-    digest = hashlib.sha256(" ".join(NUMBERS).encode()).hexdigest()[:8]
+    digest = hashlib.sha256(" ".join(numbers(QUANTITIES)).encode()).hexdigest()[:8]
     assert (checkpoint.SCHEMA, digest) == (5, "d0fdadad")
 
 

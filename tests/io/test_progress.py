@@ -20,7 +20,7 @@ def test_lines_of_the_log_are_written_together_but_soon(tmp_path, monkeypatch):
         tmp_path / "log.csv",
         Simulation(small_scene({"argon": 5}, 30.0)).run().samples.rows,
     )
-    file = run_files.Log(path, tensor=False)
+    file = run_files.Log(path, run_files.columns(tensor=False))
 
     def lines():
         return len(path.read_text().splitlines()) - 1

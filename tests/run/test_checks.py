@@ -16,6 +16,7 @@ from rigidmd.assemble.harmonic import stable_angle
 from rigidmd.core.integrators import KICK, SCHEMES
 from rigidmd.core.state import NOW
 from rigidmd.engines.cpu.engine import CpuEngine as Engine
+from rigidmd.engines.samples import Sample
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Simulation, stable_step
 from rigidmd.run import checks as watch
@@ -211,16 +212,15 @@ def test_a_thermostat_is_held_to_its_own_time_only():
     scene = small_scene({"spce": 40}, 18.5, stages=nvt, output={"log_interval_ps": 0.05})
     system, simulation = build(scene), Simulation(scene)
     rows = simulation.run().samples.rows
-    drifted = rows[-1]._replace(drift=rows[-3].drift + 0.4 * rows[-3].kinetic)
     limits = system.scene.watch
-    assert watch.check_sample(system, limits, rows[-3], drifted) is None
-    assert watch.check_sample(
-        system, limits, rows[-3], drifted._replace(drift=rows[-3].drift - rows[-3].kinetic)
-    )
-    assert (
-        watch.check_sample(system, limits, rows[0], rows[-1]._replace(drift=3 * rows[-1].kinetic))
-        is None
-    )
+
+    def problem_of(since, drift):
+        now = Sample(**vars(rows[-1]) | {"drift": drift})
+        return watch.check_sample(system, limits, rows[since], now)
+
+    assert problem_of(-3, rows[-3].drift + 0.4 * rows[-3].kinetic) is None
+    assert problem_of(-3, rows[-3].drift - rows[-3].kinetic)
+    assert problem_of(0, 3 * rows[-1].kinetic) is None
 
 
 def test_limits_can_be_set_and_lifted(capsys, tmp_path):

@@ -17,12 +17,11 @@ from support.common import BODIES, ROOT, small_scene
 from support.stops import contents
 
 import rigidmd
+from rigidmd.core.quantities import QUANTITIES
 from rigidmd.engines.observables import Observation
-from rigidmd.engines.samples import COLUMNS
 from rigidmd.errors import OutputError, SceneError, StructureError
 from rigidmd.features.bodies.motion import COLUMNS as BODY_COLUMNS
 from rigidmd.features.bodies.motion import FAMILIES
-from rigidmd.io.run_files import TENSOR
 from rigidmd.run import Every, Simulation
 from rigidmd.scene import Scene
 from rigidmd.scene.models import load_model
@@ -46,9 +45,9 @@ def test_results_are_what_the_log_states(tmp_path):
     with (tmp_path / "out" / "log.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 5
-    for name, column in COLUMNS.items():
+    for name, column in QUANTITIES.items():
         assert results.units[name] == column.unit
-        if not column.header or name in TENSOR:
+        if not column.header or column.of_tensor:
             continue
         for row, value in zip(rows, results[name], strict=True):
             told = row[column.header]
@@ -81,7 +80,7 @@ def test_the_record_and_its_table_name_the_same_units():
         "Å": "(A)",
         "°": "(deg)",
     }
-    for column in COLUMNS.values():
+    for column in QUANTITIES.values():
         if column.header:
             assert column.header.endswith(said.get(column.unit, column.header))
             assert "(" not in column.header or column.unit in said
@@ -102,7 +101,7 @@ def test_observers_see_the_units_of_the_log():
             assert getattr(reading, name) == results[name][k]
         assert sum(reading.components.values()) == pytest.approx(reading.potential)
         assert reading.kinetic_translation == pytest.approx(kinetic, rel=1e-12)
-        for name in COLUMNS:
+        for name in QUANTITIES:
             assert getattr(reading.sample, name) == pytest.approx(results[name][k], nan_ok=True)
         assert reading.momentum.shape == (3,)
         assert reading.sample.momentum == pytest.approx(np.linalg.norm(reading.momentum))

@@ -10,8 +10,9 @@ from support.common import argon, small_scene
 
 from rigidmd.assemble.build import build
 from rigidmd.commands.cli import main
+from rigidmd.core.quantities import QUANTITIES
 from rigidmd.core.statistics import mean_and_error, slope
-from rigidmd.engines.samples import COLUMNS, Sample, Samples
+from rigidmd.engines.samples import Sample, Samples
 from rigidmd.io.run_files import columns
 from rigidmd.run import Simulation, run_together
 from rigidmd.run.kind import describe
@@ -127,10 +128,12 @@ def summarised(
     samples += [(made_stage, k) for k in range(n)]
     samples += [(k, None) for k in range(made_stage + 1, len(scene.stages))]
     for k, (of_stage, index) in enumerate(samples):
-        plain = {name: 300.0 + rng.standard_normal() for name in COLUMNS if "temperature" in name}
+        plain = {
+            name: 300.0 + rng.standard_normal() for name in QUANTITIES if "temperature" in name
+        }
         own = {} if index is None else {name: float(made[name][index]) for name in made}
         row = (
-            dict.fromkeys(COLUMNS, 0.0)
+            dict.fromkeys(QUANTITIES, 0.0)
             | plain
             | {"stage_name": "", "step": k, "stage": of_stage, "kinetic": 100.0}
         )

@@ -120,8 +120,8 @@ FRESH: list[Mutation] = [
         "F13",
         "drift in kT: degrees of freedom without the total momentum where Langevin changes it",
         "run/summary.py",
-        '(temperatures["temperature_K"] or 0.0) * system.freedom_in(k).total',
-        '(temperatures["temperature_K"] or 0.0) * system.freedom.total',
+        '(means["temperature_K"] or 0.0) * system.freedom_in(k).total',
+        '(means["temperature_K"] or 0.0) * system.freedom.total',
         (
             "run/test_summary.py::test_a_drift_is_reported_in_the_thermal_energy_of_the_degrees_of_freedom_of_its_stage",
         ),
@@ -306,9 +306,9 @@ FRESH: list[Mutation] = [
     Mutation(
         "F34",
         "log: shear pressures replaced by those along an axis",
-        "engines/observables.py",
-        "{'xyz'[j]}\": (i, j)",
-        "{'xyz'[j]}\": (j, j)",
+        "core/quantities.py",
+        "o.pressure_tensor_bar[i, j]",
+        "o.pressure_tensor_bar[j, j]",
         ("run/test_results.py::test_observers_see_the_units_of_the_log",),
     ),
     Mutation(

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rigidmd.core.quantities import Quantity
 from rigidmd.core.toml import Json
-from rigidmd.engines.samples import Column
-from rigidmd.features.bodies.motion import COLUMNS, FAMILIES
+from rigidmd.features.bodies.motion import COLUMNS
 from rigidmd.features.view.kind_display import KindDisplay
 from rigidmd.scene.validation import not_none
 
@@ -52,30 +52,29 @@ class BodyDisplay(KindDisplay["BodySystem", "Motion"]):
     def animation_in_memory(self, results: "Results", record: "Record") -> "BodyAnimation":
         return self.animation(record)
 
-    def tables(self, summary: Json) -> list[tuple[str, list[tuple[str, str]]]]:
+    def tables(
+        self, system: "BodySystem", summary: Json
+    ) -> list[tuple[str, list[tuple[str, str]]]]:
         from rigidmd.features.bodies.summary import rows_of, title_of
 
         # not of a run that has not ended
         return [(title_of(summary), rows_of(summary))] if "steps" in summary else []
 
     def results_section(self, record: "Record") -> str:
+        from rigidmd.features.bodies.motion import Motion
         from rigidmd.features.bodies.summary import motion_figures, rows_of
         from rigidmd.features.view.page import section, table
 
-        of_invariants = FAMILIES["energy_error"].names + FAMILIES["L_error"].names
-        errors = [name.removesuffix("_error") for name in record.columns if name in of_invariants]
         time = ("time", f"{record.time[-1]:g} s, {len(record.time)} samples")
-        numbers = motion_figures(record.columns, errors) | {
-            "rates": (record.summary or {}).get("rates", {})
-        }
+        numbers = motion_figures(record.system, Motion(record.columns))
         return section("Results", table([], [time, *rows_of(numbers)], words=True))
 
     def stepped(self, record: "Record") -> Sequence[Json]:
         return [{"name": record.scene.name} | (record.summary or {})]
 
-    def live_columns(self, described: Mapping[str, Column]) -> Sequence[str]:
+    def live_columns(self, described: Mapping[str, Quantity]) -> Sequence[str]:
         """The first of these that it has."""
         return [name for name in ("energy_error", "energy") if name in described][:1]
 
-    def live_samples(self, run: "Simulation") -> tuple[Mapping[str, Column], float]:
+    def live_samples(self, run: "Simulation") -> tuple[Mapping[str, Quantity], float]:
         return COLUMNS, not_none(run.scene.output.interval_s)

@@ -77,8 +77,7 @@ class BodyKind(Kind[BodyScene, "BodySystem"]):
     def samples_of(self, record: "Record[BodySystem]") -> "Motion":
         from rigidmd.features.bodies.motion import Motion
 
-        errors = [name.removesuffix("_error") for name in record.columns if name.endswith("_error")]
-        return Motion(record.columns, [name for name in errors if name != "orthogonality"])
+        return Motion(record.columns)
 
     def adds_to(self, feature: str) -> object:
         if feature == "view":

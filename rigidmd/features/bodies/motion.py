@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.core.quantities import Quantity
 from rigidmd.core.state import WORK, State
-from rigidmd.engines.samples import MATRIX, Column, SampleTable
+from rigidmd.engines.samples import MATRIX, SampleTable
 from rigidmd.features.bodies.driven_rotor import DrivenRotor
 from rigidmd.features.bodies.forces.applied import (
     PythonForce,
@@ -83,7 +84,9 @@ def _with_unit(name: str, unit: str) -> str:
 
 
 COLUMNS = {
-    n: Column(_with_unit(n, f.unit), f.unit, f.about) for f in FAMILIES.values() for n in f.names
+    n: Quantity(n, _with_unit(n, f.unit), f.unit, f.about)
+    for f in FAMILIES.values()
+    for n in f.names
 }
 #: Header of a column of motion.csv -> its name, also without units, as earlier versions wrote them.
 NAMES = {name: name for name in COLUMNS} | {"t": "time"} | {c.header: n for n, c in COLUMNS.items()}
@@ -102,19 +105,22 @@ class Motion(SampleTable):
         attitude and omega are relative to the frame. L is the angular momentum relative to
         non-rotating axes, wheels (h) included, along the axes of the frame (lab) or of the body.
         The kinetic energy is without that of wheels about their axes.
-    invariants : names of conserved quantities. Column NAME_error is the change since the start, of
-        energies relative to the largest kinetic energy, of L relative to the largest |L|.
     """
 
     columns: dict[str, np.ndarray]
-    invariants: list[str]
 
     def __post_init__(self) -> None:
-        self.described = {name: COLUMNS[name] for name in self.columns}
+        self.described = {name: COLUMNS[name] for name in self.columns if name in COLUMNS}
         if FAMILIES["rotation"].names[0] in self.columns:
-            self.described[MATRIX] = Column(
-                "", "1", "the rotation matrices (n, 3, 3): lab = Q body"
-            )
+            about = "the rotation matrices (n, 3, 3): lab = Q body"
+            self.described[MATRIX] = Quantity(MATRIX, "", "1", about)
+
+    @property
+    def invariants(self) -> list[str]:
+        """Names of conserved quantities. Column NAME_error is the change since the start, of
+        energies relative to the largest kinetic energy, of L relative to the largest |L|."""
+        names = FAMILIES["energy_error"].names + FAMILIES["L_error"].names
+        return [name.removesuffix("_error") for name in names if name in self.columns]
 
     def _array(self, name: str) -> np.ndarray:
         """An array (t,) in SI units; of "Q", for a body that rotates, matrices (t, 3, 3)."""
@@ -144,13 +150,12 @@ def motion(system: BodySystem, snapshots: list[Snapshot]) -> Motion:
             columns |= _columns(f"{name}_body", body)
             columns |= _columns(f"{name}_lab", np.einsum("tij,tj->ti", rotation, body))
     columns |= energies(system, times, states)
-    errors = _errors(system, columns)
-    columns |= {f"{name}_error": error for name, error in errors.items()}
+    columns |= {f"{name}_error": error for name, error in _errors(system, columns).items()}
     if system.rotates:
         columns["orthogonality_error"] = np.abs(
             np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)
         ).max(axis=(1, 2))
-    return Motion(columns, list(errors))
+    return Motion(columns)
 
 
 def _columns(family: str, values: np.ndarray) -> dict[str, np.ndarray]:

@@ -1,6 +1,6 @@
 """Runs of a single body: samples at regular times, columns at the end, figures."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from math import ceil, inf
@@ -221,7 +221,6 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
     """The part of a simulation of a single body."""
 
     record_type = BodyRecord
-    summary_text = short_summary = staticmethod(summary_text)
 
     def __init__(
         self,
@@ -391,6 +390,9 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
             *self.record.notes,
         ]
         return summary
+
+    def summary_text(self, summary: Json, known: Container[str], *, is_short: bool) -> str:
+        return summary_text(summary, known)
 
     def explain(self, error: SimulationError) -> str:
         return self._watch.explain(error, self.record.stable)

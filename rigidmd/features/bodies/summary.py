@@ -2,7 +2,7 @@
 text. The energies of the start as text."""
 
 import math
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Container
 
 import numpy as np
 
@@ -60,22 +60,22 @@ def summarise_body(
         "wall_s": wall,
         "computing_s": computing,
         "steps_per_s": steps / computing if computing > 0 else None,
-        **motion_figures(motion.columns, motion.invariants),
-        "rates": {name: rate._asdict() for name, rate in body_rates(system, motion).items()},
+        **motion_figures(system, motion),
         "trajectory_A_per_m": system.scale,
         "notes": notes,
     }
 
 
-def motion_figures(columns: Mapping[str, np.ndarray], invariants: Iterable[str]) -> dict:
-    """The part of a body's summary that follows from the columns of its motion."""
+def motion_figures(system: BodySystem, motion: Motion) -> dict:
+    """The part of a body's summary that follows from its motion."""
+    columns = motion.columns
     theta, orthogonality = columns.get("theta"), columns.get("orthogonality_error")
     return {
         "energy_start_J": float(columns["energy"][0]),
         "energy_end_J": float(columns["energy"][-1]),
         "work_J": float(columns["work"][-1]),
         "largest_relative_error": {
-            name: float(np.abs(columns[f"{name}_error"]).max()) for name in invariants
+            name: float(np.abs(columns[f"{name}_error"]).max()) for name in motion.invariants
         },
         "largest_orthogonality_error": (
             None if orthogonality is None else float(orthogonality.max())
@@ -83,6 +83,7 @@ def motion_figures(columns: Mapping[str, np.ndarray], invariants: Iterable[str])
         "theta_range_deg": (
             None if theta is None else np.degrees([theta.min(), theta.max()]).tolist()
         ),
+        "rates": {name: rate._asdict() for name, rate in body_rates(system, motion).items()},
     }
 
 
@@ -115,7 +116,7 @@ RATES = {
 
 def _rate(rate: dict, pattern: str) -> str:
     """A rate as measured and by theory."""
-    measured, theory = rate.get("measured"), rate.get("theory")
+    measured, theory = rate["measured"], rate["theory"]
     if measured is None:
         theory = math.nan if theory is None else theory
         return (
@@ -144,9 +145,7 @@ def rows_of(summary: dict) -> list[tuple[str, str]]:
         low, high = summary["theta_range_deg"]
         rows.append(("theta", f"between {low:.6f}° and {high:.6f}°"))
     rows += [
-        (RATES[name][0], _rate(rate, RATES[name][1]))
-        for name, rate in summary.get("rates", {}).items()
-        if name in RATES
+        (RATES[name][0], _rate(rate, RATES[name][1])) for name, rate in summary["rates"].items()
     ]
     for name, error in summary["largest_relative_error"].items():
         of = "the largest kinetic energy" if name == "energy" else "the largest |L|"

@@ -1,13 +1,13 @@
 """[coupling] of a scene: its defaults, the species with scaled charges, and the energies at other
 values of lambda."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 
 from rigidmd.assemble.build import acting_in
-from rigidmd.core.state import State
-from rigidmd.engines.cpu.engine import CpuEngine
-from rigidmd.engines.samples import Column
+from rigidmd.core.quantities import Quantity
+from rigidmd.engines.observables import Observation
 from rigidmd.engines.system import Extra, System
 from rigidmd.forces.parts import Interactions, SystemParts
 from rigidmd.scene import MolecularScene
@@ -56,57 +56,41 @@ def coupled(parts: SystemParts) -> SystemParts:
     return parts._replace(species=species)
 
 
-@dataclass(frozen=True)
-class OtherLambdas(Extra):
-    """The interactions at coupling.lambdas, whose energies are columns."""
-
-    at: Mapping[float, Interactions] = field(default_factory=dict)
-
-    def values(self, system: System, state: State, potential: float) -> list[float]:
-        """Energies at each of coupling.lambdas less the present one, u Å²/ps²."""
-        present = not_none(system.scene.coupling).value
-        changes = []
-        for value, engine in self._engines(system).items():
-            if value == present:
-                changes.append(0.0)
-                continue
-            at = self.at[value]
-            engine.renew_lists()  # so that the bits do not depend on earlier states
-            energy = sum(tally.energy for tally in engine.evaluate(state)[1].values())
-            energy += 0.0 if at.tail is None else at.tail.energy(state.volume)
-            changes.append(energy + sum(at.constants.values()) - potential)
-        return changes
-
-    def _engines(self, system: System) -> dict[float, CpuEngine]:
-        """An engine of the interactions at each value, made once for a system."""
-        if NAME not in system.cache:
-            precision = system.precision
-            system.cache[NAME] = {
-                x: system.engine_of(at.terms, precision) for x, at in self.at.items()
-            }
-        return system.cache[NAME]
-
-
 def with_other_lambdas(system: System, parts: SystemParts) -> System:
     """The system with the energies at coupling.lambdas, and a note. Raises SceneError.
 
     parts : with whole charges
     """
     coupling = not_none(parts.scene.coupling)
-    at = {}
+    rows = []
     for value in coupling.lambdas:
         scene = parts.scene.model_copy(update={"coupling": coupling.at(value)})
-        at[value] = acting_in(coupled(parts._replace(scene=scene)))
-    columns = dict(map(lambda_column, at))
+        at = acting_in(coupled(parts._replace(scene=scene)))
+        rows.append(energy_to_lambda(value, partial(_change, value, at)))
     system.notes.append(coupling.in_short)
-    return replace(
-        system, extras=system.extras | {NAME: OtherLambdas(columns=columns, at=at, titles=TITLES)}
-    )
+    extra = Extra(titles=TITLES, quantities=tuple(rows))
+    return replace(system, extras=system.extras | {NAME: extra})
 
 
-def lambda_column(value: float) -> tuple[str, Column]:
-    """Name and column of the energy at a lambda of coupling.lambdas."""
+def energy_to_lambda(
+    value: float, change: Callable[[Observation], float] | None = None
+) -> Quantity:
+    """The energy at one of coupling.lambdas."""
     about = f"potential energy at lambda = {value:g} less the present one, of the same state"
-    return f"energy_to_lambda_{value:g}", Column(
-        f"Energy to lambda {value:g} (kJ/mole)", "kJ/mol", about
-    )
+    header = f"Energy to lambda {value:g} (kJ/mole)"
+    return Quantity(f"energy_to_lambda_{value:g}", header, "kJ/mol", about, change)
+
+
+def _change(value: float, at: Interactions, observation: Observation) -> float:
+    """The energy with the interactions at a lambda less the present one."""
+    system, state = observation.system, observation.state
+    if value == not_none(system.scene.coupling).value:
+        return 0.0
+    engine = system.cache.setdefault(NAME, {}).get(value)
+    if engine is None:
+        engine = system.cache[NAME][value] = system.engine_of(at.terms, system.precision)
+    engine.renew_lists()  # so that the bits do not depend on earlier states
+    energy = sum(tally.energy for tally in engine.evaluate(state)[1].values())
+    energy += 0.0 if at.tail is None else at.tail.energy(state.volume)
+    energy = energy + sum(at.constants.values()) - sum(observation.energies.values())
+    return energy / observation.energy_unit

@@ -10,7 +10,7 @@ from rigidmd.errors import OutputError
 from rigidmd.features.analysis.files import write_results
 from rigidmd.features.analysis.registry import SweepAnalysis
 from rigidmd.features.analysis.result import AnalysisResult
-from rigidmd.features.free_energy.coupling import lambda_column
+from rigidmd.features.free_energy.coupling import energy_to_lambda
 from rigidmd.features.free_energy.estimate import (
     ABOUT,
     NAME,
@@ -82,7 +82,7 @@ def _free_energy(manifest: Manifest) -> tuple[AnalysisResult, Json]:
                 f"{record.folder}: {NAME} needs a last stage at constant temperature (nvt, npt)"
             )
         temperatures.add(float(stage.temperatures[1]))
-        names = [lambda_column(value)[0] for value in lambdas]
+        names = [energy_to_lambda(value).name for value in lambdas]
         missing = [f"{x:g}" for x, n in zip(lambdas, names, strict=True) if n not in record.columns]
         if missing:
             raise OutputError(

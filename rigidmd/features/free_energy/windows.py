@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from rigidmd.core.quantities import restrained_distance
 from rigidmd.core.toml import Json
-from rigidmd.engines.samples import distance_column
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError
 from rigidmd.features.analysis.files import write_results
@@ -127,8 +127,8 @@ def used_together(uses: Sequence[Json]) -> Json:
 def _window(folder: Path, k: int) -> tuple[Window, float, Json]:
     """The window of a run, its temperature (K), and the samples used."""
     record, stage, production = production_of(folder)
-    name, column = distance_column(k)
-    if name not in record.columns:
+    column = restrained_distance(k)
+    if column.name not in record.columns:
         problem = f"fields.restraints.{k} has no `between`"
         raise OutputError(f"{folder}: its log has no column {column.header!r}: {problem}")
     if stage.temperature_K is None or stage.ramps or stage.changes_box:
@@ -136,7 +136,7 @@ def _window(folder: Path, k: int) -> tuple[Window, float, Json]:
             f"{folder}: the windows need a last stage at constant temperature and volume (nvt)"
         )
     restraint = record.system.scene.fields.restraints[k]
-    samples = record.columns[name][production]
+    samples = record.columns[column.name][production]
     window = Window(not_none(restraint.distance_A), restraint.stiffness[0], samples)
     return window, float(stage.temperatures[1]), used_samples(record, stage, production)
 

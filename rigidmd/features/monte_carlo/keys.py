@@ -1,15 +1,27 @@
 """Hybrid Monte Carlo in scenes."""
 
+from functools import partial
+from math import nan
 from typing import Annotated
 
 from pydantic import Field, Strict
 
 from rigidmd.core.integrators import Scheme
+from rigidmd.core.quantities import Mean, Quantity
 from rigidmd.scene.ensemble_methods import StageKeys, Thermostat, Values
 from rigidmd.scene.validation import Section, number_of_steps
 
 #: Length of a trajectory, ps.
 TRAJECTORY_PS = 0.1
+#: Columns of `TrajectoryWorkspace.sums`: trajectories ended and accepted; sums of abs(dH)/kT, of
+#: min(1, exp(-dH/kT)), and of exp(-dH/kT), whose mean is 1 in equilibrium.
+ENDED, ACCEPTED, SIZES, CHANCES, WEIGHTS = range(5)
+SINCE = "the trajectories of hybrid Monte Carlo since the line before"
+
+
+def _per_trajectory(k: int, observation) -> float:
+    sums = observation.extension_sums
+    return float(sums[k] / sums[ENDED]) if sums is not None and sums[ENDED] else nan
 
 
 class HybridMonteCarloKeys(Section):
@@ -32,7 +44,32 @@ class HybridMonteCarlo(Thermostat):
     steps_key = "trajectory_steps"
     pilot = "rigidmd.features.monte_carlo.pilot"
     no_motion = "samples by hybrid Monte Carlo"
-    columns = ("acceptance", "abs_dH_kT", "exp_minus_dH")
+    quantities = (
+        Quantity(
+            "acceptance",
+            "Acceptance",
+            "1",
+            f"fraction of {SINCE} that was accepted",
+            partial(_per_trajectory, ACCEPTED),
+            mean=Mean("acceptance{}_mean"),
+        ),
+        Quantity(
+            "abs_dH_kT",
+            "abs(dH) (kT)",
+            "kT",
+            f"mean size of the change of the energy in {SINCE}",
+            partial(_per_trajectory, SIZES),
+            mean=Mean("abs_dH_kT{}_mean"),
+        ),
+        Quantity(
+            "exp_minus_dH",
+            "exp(-dH/kT)",
+            "1",
+            f"mean over {SINCE}. In equilibrium 1 on average",
+            partial(_per_trajectory, WEIGHTS),
+            mean=Mean("exp_minus_dH{}_mean"),
+        ),
+    )
 
     @property
     def flow(self) -> str:

@@ -7,8 +7,7 @@ from rigidmd.assemble.harmonic import stable_angle
 from rigidmd.core.state import NOW, State
 from rigidmd.engines.system import System
 from rigidmd.errors import SimulationError
-from rigidmd.features.monte_carlo.keys import HybridMonteCarloKeys
-from rigidmd.features.monte_carlo.trajectories import CHANCES, ENDED
+from rigidmd.features.monte_carlo.keys import CHANCES, ENDED, HybridMonteCarloKeys
 from rigidmd.run.pilot.choice import round_down
 from rigidmd.run.pilot.sampling import begun, mean_square_rate
 from rigidmd.run.stable_step import stiffest_mode

@@ -28,11 +28,9 @@ from rigidmd.dynamics.noise import uniforms
 from rigidmd.dynamics.registers import KEPT_BY_EXTENSION, Timing
 from rigidmd.dynamics.step_parts import StepExtension, StepParts
 from rigidmd.dynamics.thermostats import kinetic_energies_of, ramp_value
+from rigidmd.features.monte_carlo.keys import ACCEPTED, CHANCES, ENDED, SIZES, WEIGHTS
 from rigidmd.forces.terms import FORCES_ONLY, copy
 
-#: Columns of `TrajectoryWorkspace.sums`: trajectories ended and accepted; sums of abs(dH)/kT, of
-#: min(1, exp(-dH/kT)), and of exp(-dH/kT), whose mean is 1 in equilibrium.
-ENDED, ACCEPTED, SIZES, CHANCES, WEIGHTS = range(5)
 #: Largest abs(dH)/kT in `SIZES` and -dH/kT in `WEIGHTS`, so that sums stay finite where a
 #: trajectory diverges and where energies fall from a bad start.
 LARGEST = 600.0

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.core.integrators import DRIFT, KICK
+from rigidmd.core.quantities import QUANTITIES
 from rigidmd.core.statistics import inefficiency, mean_and_error
 from rigidmd.dynamics.model import mobile
-from rigidmd.engines.samples import IN_LOGS
 from rigidmd.engines.system import System
 from rigidmd.features.analysis.rigid_frames import production_samples
 from rigidmd.features.studies.extrapolation import (
@@ -28,8 +28,9 @@ from rigidmd.run.record import Record
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 
-POTENTIAL = "Potential Energy per molecule (kJ/mole)"
-VOLUME, DENSITY = IN_LOGS["volume"].header, IN_LOGS["density"].header
+POTENTIAL, VOLUME, DENSITY = (
+    QUANTITIES[name].mean_header for name in ("potential", "volume", "density")
+)
 #: Sums of squares of forces and torques in the log.
 SQUARES = ("force_squares", "torque_squares")
 GAS_CONSTANT = BOLTZMANN / KJ_PER_MOL  # kJ/mol/K
@@ -111,7 +112,7 @@ def results_of_run(record: Record[System]) -> RunResults | str:
     at = _conditions(record, stage)
     columns = {name: values[production] for name, values in record.columns.items()}
     if not all(np.isfinite(columns.get(name, np.nan)).all() for name in SQUARES):
-        names = " and ".join(IN_LOGS[name].header for name in SQUARES)
+        names = " and ".join(QUANTITIES[name].header for name in SQUARES)
         return f"the log has no {names}, which runs of earlier versions lack"
     samples = _Samples(
         columns["potential"] / at.count,

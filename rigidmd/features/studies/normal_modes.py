@@ -17,12 +17,11 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from rigidmd.core.state import NOW, State
 from rigidmd.engines.observables import observe
-from rigidmd.engines.samples import energy_column
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.features.studies.gamma_point import cells_of, periodic_basis
 from rigidmd.io.folder import LOG, SCENE, SUMMARY
-from rigidmd.io.run_files import Log
+from rigidmd.io.run_files import Log, columns
 from rigidmd.io.scene_file import input_names, write_scene
 from rigidmd.io.write import Column, ReportTable, write_json
 from rigidmd.run import Simulation
@@ -479,8 +478,7 @@ def write_animation(folder: Path, modes: NormalModes, number: int) -> None:
     q = AMPLITUDE / np.abs(c.scale * modes.vector[k]).max() * modes.vector[k]
     write_scene(folder, scene)
     write_topology(folder / output.topology, system, c.state, wrapped=False)
-    energies = {name: energy_column(name) for name in system.user_terms}
-    log = Log(folder / LOG, tensor=False, kept=None, more=energies)
+    log = Log(folder / LOG, columns(system.quantities, tensor=False))
     frames = open_trajectory(
         folder / str(output.trajectory), system, period / FRAMES, velocities=False, wrapped=False
     )

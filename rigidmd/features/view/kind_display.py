@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar, cast
 
 import numpy as np
 
+from rigidmd.core.quantities import Quantity
 from rigidmd.core.toml import Json
-from rigidmd.engines.samples import Column, SampleTable, moving
+from rigidmd.engines.samples import SampleTable, moving
 from rigidmd.engines.sites import AnySystem
 from rigidmd.run.kind import kind_of
 from rigidmd.scene import Scene
@@ -63,7 +64,7 @@ class KindDisplay(ABC, Generic[SystemT, SamplesT]):
         """The animation of results, for a notebook. Raises OutputError."""
 
     @abstractmethod
-    def tables(self, summary: Json) -> list[tuple[str, list[tuple[str, str]]]]:
+    def tables(self, system: SystemT, summary: Json) -> list[tuple[str, list[tuple[str, str]]]]:
         """Titles and rows of the tables of a summary."""
 
     @abstractmethod
@@ -75,11 +76,11 @@ class KindDisplay(ABC, Generic[SystemT, SamplesT]):
         """The parts of a summary with a time step and its longest stable one."""
 
     @abstractmethod
-    def live_columns(self, described: Mapping[str, Column]) -> Sequence[str]:
+    def live_columns(self, described: Mapping[str, Quantity]) -> Sequence[str]:
         """The default columns of a live plot."""
 
     @abstractmethod
-    def live_samples(self, run: "Simulation") -> tuple[Mapping[str, Column], float]:
+    def live_samples(self, run: "Simulation") -> tuple[Mapping[str, Quantity], float]:
         """The columns that the samples of a run will have, and their interval."""
 
 
@@ -120,10 +121,11 @@ class MolecularDisplay(KindDisplay["System", "Samples"]):
         frames = frames_in_memory(results, record.system, record)
         return MoleculeAnimation(record, frames=frames)
 
-    def tables(self, summary: Json) -> list[tuple[str, list[tuple[str, str]]]]:
+    def tables(self, system: "System", summary: Json) -> list[tuple[str, list[tuple[str, str]]]]:
         from rigidmd.run.report import stage_rows, stage_title
 
-        return [(stage_title(stage), stage_rows(stage)) for stage in summary["stages"]]
+        described = system.quantities
+        return [(stage_title(stage), stage_rows(stage, described)) for stage in summary["stages"]]
 
     def results_section(self, record: "Record") -> str:
         from rigidmd.features.view.page import section
@@ -134,10 +136,10 @@ class MolecularDisplay(KindDisplay["System", "Samples"]):
     def stepped(self, record: "Record") -> Sequence[Json]:
         return (record.summary or {}).get("stages", ())
 
-    def live_columns(self, described: Mapping[str, Column]) -> Sequence[str]:
+    def live_columns(self, described: Mapping[str, Quantity]) -> Sequence[str]:
         return ("temperature", "drift")
 
-    def live_samples(self, run: "Simulation") -> tuple[Mapping[str, Column], float]:
+    def live_samples(self, run: "Simulation") -> tuple[Mapping[str, Quantity], float]:
         return run._part.samples().described, run.scene.output.log_interval_ps
 
 

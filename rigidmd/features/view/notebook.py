@@ -48,14 +48,13 @@ def simulation_html(simulation: Simulation) -> str:
 def results_html(results: Results) -> str:
     summary = results.summary
     name = results.system.scene.name
-    display = display_of(results.system.scene)
+    system = results.system
+    display = display_of(system.scene)
     text = [
         f"<p>{html.escape(title)}</p>{table([], rows, words=True)}"
-        for title, rows in display.tables(summary)
+        for title, rows in display.tables(system, summary)
     ]
-    stem, drawn = next(
-        iter(display.figures(results.system, results.samples, summary).items()), ("", None)
-    )
+    stem, drawn = next(iter(display.figures(system, results.samples, summary).items()), ("", None))
     left = f"{''.join(text)}{notes(summary['notes'])}"
     right = drawing_of(drawn, f"{name}-{stem}", f"figure: {stem}")
     return framed(name, results._summary_line, f"{sides(left, right)}{_columns(results)}")

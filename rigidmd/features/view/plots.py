@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from rigidmd.core.quantities import Quantity
 from rigidmd.core.toml import Json
-from rigidmd.engines.samples import MATRIX, Column, SampleTable
+from rigidmd.engines.samples import MATRIX, SampleTable
 from rigidmd.engines.sites import AnySystem
 from rigidmd.features.view.figures.panels import Panel, draw_rows, stack
 from rigidmd.features.view.figures.picture import Picture
@@ -82,7 +83,7 @@ def plot(results: Results, *columns: str, log: bool = False) -> Picture:
 
 
 def check_names(
-    names: Sequence[str], described: Mapping[str, Column], figures: Iterable[str] = ()
+    names: Sequence[str], described: Mapping[str, Quantity], figures: Iterable[str] = ()
 ) -> None:
     """Raise KeyError, with a suggestion, for a name that is not a column of numbers."""
     known = [name for name, column in described.items() if column.unit and name != MATRIX]
@@ -95,7 +96,7 @@ def check_names(
 
 
 def columns_figure(
-    record: Record, names: Sequence[str], described: dict[str, Column], *, log: bool = False
+    record: Record, names: Sequence[str], described: Mapping[str, Quantity], *, log: bool = False
 ) -> Picture:
     """Columns against time, with one panel for each unit."""
     units: dict[str, list[str]] = {}

@@ -23,4 +23,5 @@ def stage_tables(record: Record) -> Iterator[str]:
             moves = ended.get("moves_tried", 0), ended.get("moves_accepted", 0)
             stage = stage_summary(system, samples, k, ended.get("computing_s", 0.0), moves)
             yield f"<p>{html.escape(stage_title(stage))}</p>"
-            yield table([], stage_rows(stage | {"choice": ended.get("choice")}), words=True)
+            stage["choice"] = ended.get("choice")
+            yield table([], stage_rows(stage, system.quantities), words=True)

@@ -33,8 +33,9 @@ class DistanceRestraint(NamedTuple):
     distance: float  # Å
     stiffness: float  # u/ps²
 
-    def distance_in(self, state: State) -> float:
-        """The distance r of the groups in a state, Å."""
+    def observed_distance(self, observation) -> float:
+        """The distance r of the groups in an `Observation`, Å."""
+        state = observation.state
         start, end = (
             _centre_in(state, *group)
             for group in ((self.first, self.first_fraction), (self.second, self.second_fraction))

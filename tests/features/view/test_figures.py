@@ -15,7 +15,8 @@ from support.common import ROOT, small_scene
 
 from rigidmd.assemble.build import build
 from rigidmd.core.integrators import SCHEMES
-from rigidmd.engines.samples import NUMBERS, Sample, Samples
+from rigidmd.core.quantities import QUANTITIES
+from rigidmd.engines.samples import Sample, Samples
 from rigidmd.features.analysis.curve_figure import curve_figure as drawn
 from rigidmd.features.analysis.result import Curve
 from rigidmd.features.bodies.trials import body_trial_system
@@ -146,7 +147,7 @@ def samples_of(rng, start=-1000.0):
     """Samples of a run of STAGES; a minimisation starts far above, and its first stage starts far
     from its mean."""
     rows, step = [], 0
-    blank = dict.fromkeys(Sample._fields, 0.0) | {"user_energies": ()}
+    blank = dict.fromkeys(QUANTITIES, 0.0)
     for k, (name, steps) in enumerate(zip(STAGES, STEPS, strict=True)):
         for n in range(steps or 2):
             step += bool(steps)
@@ -168,9 +169,10 @@ def samples_of(rng, start=-1000.0):
                 "drift": rng.normal(),
             }
             rows.append(Sample(**blank | given | noise | {"temperature_rotation": float("nan")}))
-    return Samples(
-        STAGES, table=np.array([[float(getattr(row, name)) for name in NUMBERS] for row in rows])
-    )
+    samples = Samples(STAGES)
+    for row in rows:
+        samples.append(row)
+    return samples
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,10 @@ import numpy as np
 
 from rigidmd.assemble.defaults import with_momentum_removal
 from rigidmd.core.plain_text import did_you_mean, distinct
+from rigidmd.core.quantities import QUANTITIES
 from rigidmd.dynamics.model import count_degrees_of_freedom
 from rigidmd.engines.cpu.compiled import LOAD
 from rigidmd.engines.cpu.engine import BOX, EXTENSION, CompileError
-from rigidmd.engines.samples import IN_LOGS
 from rigidmd.engines.system import System, TermMaker, ThermostatOfStages
 from rigidmd.errors import SceneError, describe_error
 from rigidmd.features.potentials.extra import UserExtra, with_extra
@@ -49,7 +49,7 @@ RESERVED = {
     **dict.fromkeys(
         ("tail", "lennard_jones_tail"), "the name of the energy of the tail correction"
     ),
-    **dict.fromkeys(IN_LOGS, "a column of the log"),
+    **dict.fromkeys(QUANTITIES, "a column of the log"),
 }
 
 
@@ -135,7 +135,7 @@ def with_user_code(system: System, *, is_start: bool = True) -> System:
     forces = [*custom_forces(scene), *added]
     force_names = [*(entry.label for entry in scene.forces.added.values()), *map(name_of, added)]
     names = distinct(force_names, [*system.terms, *system.constants])
-    reserved = RESERVED | dict.fromkeys(system.more_columns, "a column of the log")
+    reserved = RESERVED | dict.fromkeys(system.quantities, "a column of the log")
     errors = [
         f"{name} is {reserved[name]}. Name the force otherwise"
         for name in names

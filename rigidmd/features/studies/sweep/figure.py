@@ -20,9 +20,9 @@ from rigidmd.features.studies.sweep.table import (
     DENSITY,
     DRIFT,
     PRESSURE,
-    SHORT,
     SweepRow,
     Table,
+    main_titles,
     report_of,
     table_of,
 )
@@ -144,7 +144,8 @@ def draw_table(table: Table, columns: list[str], *, connected: bool = True) -> "
     rows = [row for row in table.rows if row.runs]
     numbers = [key for key in table.keys if all(_is_number(row.values[key]) for row in rows)]
     key = [*numbers, *table.keys, SEED][0]
-    titles = [SHORT.get(column, column).replace("kJ/mole", "kJ/mol") for column in columns]
+    of_main = main_titles()
+    titles = [of_main.get(column, column).replace("kJ/mole", "kJ/mol") for column in columns]
     figure, axes = _panels(titles)
     if key == SEED:
         for axis, column in zip(axes, columns, strict=True):

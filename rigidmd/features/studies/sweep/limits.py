@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from rigidmd.core.quantities import QUANTITIES
 from rigidmd.core.statistics import format_signed
 from rigidmd.core.toml import Json
-from rigidmd.engines.samples import COLUMNS, IN_LOGS
 from rigidmd.engines.system import System
 from rigidmd.errors import RigidMDError, SceneError
 from rigidmd.features.analysis.files import read_table
@@ -32,14 +32,13 @@ from rigidmd.features.studies.sweep.folder import Manifest, describe_values, poi
 from rigidmd.features.studies.sweep.table import (
     DENSITY,
     DRIFT,
-    MAIN,
     POTENTIAL,
     PRESSURE,
-    SHORT,
     Measured,
     SweepRow,
     Table,
     key_cells,
+    main_titles,
     measured_values,
     report_of,
     summarise_run,
@@ -50,6 +49,7 @@ from rigidmd.io.folder import add_to_folder
 from rigidmd.io.write import Cell, ReportTable, nine_digits
 from rigidmd.run.record import read_record
 from rigidmd.scene import Scene, is_molecular
+from rigidmd.scene.ensembles import THERMOSTATS
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, BOLTZMANN
 
@@ -67,9 +67,10 @@ TOO_SHORT = "the runs are too short and too few for an error"
 #: Relative rounding error of a mean of equal numbers.
 ROUNDING = 1e-12
 TEMPERATURES = [
-    IN_LOGS[f"temperature{motion}"].header for motion in ("", "_translation", "_rotation")
+    QUANTITIES[f"temperature{motion}"].header for motion in ("", "_translation", "_rotation")
 ]
-OF_LOG = {POTENTIAL, *(column.header for column in IN_LOGS.values())}
+OF_THERMOSTATS = [row for method in THERMOSTATS.values() for row in method.quantities]
+OF_LOG = {POTENTIAL, *(row.header for row in (*QUANTITIES.values(), *OF_THERMOSTATS))}
 #: Keys of a stage that change no average at a step of 0.
 OF_METHODS = ("integrator", "thermostat")
 #: The step at which a bias reaches this fraction of the scale of its quantity is reported.
@@ -124,7 +125,7 @@ class Limit(NamedTuple):
 
     @property
     def title(self) -> str:
-        return SHORT.get(self.quantity, self.quantity)
+        return main_titles().get(self.quantity, self.quantity)
 
     @property
     def label(self) -> str:
@@ -390,10 +391,11 @@ def _parts(limits: Limits, command: str) -> Iterator[str]:
 def _figure(limits: Limits):
     """A panel for each of the main averages: means with error bars, the fit, and the limit with its
     error at 0."""
-    of_log = [column.header for column in COLUMNS.values()]
+    main = list(main_titles())
+    of_log = [column.header for column in QUANTITIES.values()]
 
     def rank(name: str) -> int:
-        return MAIN.index(name) if name in MAIN else len(MAIN) + (name in of_log)
+        return main.index(name) if name in main else len(main) + (name in of_log)
 
     independent = [limit for limit in limits.limits if limit.kind == INDEPENDENT]
     quantities = dict.fromkeys(limit.quantity for limit in independent)

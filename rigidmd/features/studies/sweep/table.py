@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rigidmd.core.display import Displayed
+from rigidmd.core.quantities import QUANTITIES, with_means
 from rigidmd.core.statistics import format_with_error, mean_and_error, standard_error
 from rigidmd.core.toml import Json
-from rigidmd.engines.samples import IN_LOGS, NOT_AVERAGED
 from rigidmd.engines.system import System
 from rigidmd.errors import RigidMDError
 from rigidmd.features.analysis.files import TableEntry
@@ -33,14 +33,14 @@ from rigidmd.run.record import Record, read_record
 if TYPE_CHECKING:
     import pandas
 
-POTENTIAL, DRIFT = "Potential Energy per molecule (kJ/mole)", "Drift (kT/ns per degree of freedom)"
-DENSITY, PRESSURE = "Density (g/mL)", "Pressure (bar)"
-#: Columns of the printed table and the figure.
-MAIN = ("Temperature (K)", POTENTIAL, PRESSURE, DENSITY, DRIFT)
-#: Short titles for the printed table.
-SHORT = {POTENTIAL: "U per molecule (kJ/mol)", DRIFT: "drift (kT/ns/DOF)"}
-#: The box, whose averages over an earlier stage are in the table if that stage changes it.
-OF_BOX = tuple(IN_LOGS[name].header for name in ("volume", "a", "b", "c", "alpha", "beta", "gamma"))
+POTENTIAL, PRESSURE, DENSITY, DRIFT = (
+    QUANTITIES[name].mean_header for name in ("potential", "pressure_bar", "density", "drift")
+)
+
+
+def main_titles() -> dict[str, str]:
+    """The main columns, and their titles in the printed table and the figure."""
+    return {row.mean_header: mean.brief or row.header for row, mean in with_means() if mean.is_main}
 
 
 @dataclass
@@ -142,6 +142,7 @@ class Table(Displayed):
         their errors."""
         short = short_keys(self.keys)
         headers = {key: f"set {readable_key(short[key])}" for key in self.keys}
+        titles = main_titles()
         lines = []
         for row in self.rows:
             line = {headers[key]: value_name(value) for key, value in row.values.items()}
@@ -149,7 +150,7 @@ class Table(Displayed):
             for name in self.main_columns():
                 mean, error = row[name]
                 text = format_with_error(mean, error) if isfinite(mean) else "-"
-                line[SHORT.get(name, name)] = text
+                line[titles.get(name, name)] = text
             lines.append(line)
         return report_of(lines)
 
@@ -158,7 +159,7 @@ class Table(Displayed):
         the last one."""
         earlier = [column for column in self.columns if column.endswith(f": {DENSITY}")]
         more = [name for _, study in studies() for name in study.main_columns]
-        return [name for name in (*MAIN, *more) if name in self.columns] + earlier
+        return [name for name in (*main_titles(), *more) if name in self.columns] + earlier
 
 
 def report_of(lines: Sequence[Mapping[str, Cell]]) -> ReportTable:
@@ -214,16 +215,16 @@ def summarise_run(record: Record) -> dict[str, Measured]:
         return study.summarise(record)
     _, production = production_samples(record)
     results = _means_of(record, production)
+    of_box = [row.header for row in QUANTITIES.values() if row.of_box]
     for stage, samples in earlier_production(record):
         means = _means_of(record, samples)
-        headers = [*MAIN, *OF_BOX] if stage.changes_box else [*MAIN]
-        for header in headers:
-            if header in means and (stage.changes_box or header != DENSITY):
+        for header in dict.fromkeys([*main_titles(), *of_box]):
+            if header in means and (stage.changes_box or header not in of_box):
                 results[f"{stage.label}: {header}"] = means[header]
     last = ((record.summary or {}).get("stages") or [{}])[-1]
-    drift = last.get("drift_kT_ns_per_degree_of_freedom")
-    if drift is not None:
-        results[DRIFT] = drift, last.get("drift_error_kT_ns_per_degree_of_freedom")
+    for row, mean in with_means():
+        if not row.is_averaged and (value := last.get(mean.key.format(""))) is not None:
+            results[row.mean_header] = value, last.get(mean.key.format("_error"))
     return results
 
 
@@ -232,13 +233,12 @@ def _means_of(record: Record[System], samples: np.ndarray) -> dict[str, Measured
     means: dict[str, Measured] = {}
     described = record.log.described
     for name, values in record.columns.items():
-        if name in NOT_AVERAGED:
-            continue
-        average, error = mean_and_error(values[samples])
+        row = described[name]
+        average, error = mean_and_error(values[samples]) if row.is_averaged else (None, None)
         if average is None:
             continue
-        means[described[name].header] = average, error or None
-        if name == "potential":
+        means[row.header] = average, error or None
+        if row.mean and row.mean.per_molecule:
             n = len(record.system.model.species)
-            means[POTENTIAL] = average / n, None if error is None else error / n
+            means[row.mean_header] = average / n, None if error is None else error / n
     return means

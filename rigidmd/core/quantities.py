@@ -1,0 +1,347 @@
+"""The table of quantities of runs: what is sampled, averaged and shown, and how.
+
+A row is all that a quantity takes: the log, `results[...]`, the summary, reports, pages and sweeps
+read this table.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import hypot, inf, isfinite, nan
+
+from rigidmd.core.state import HEAT, NOW, WORK
+from rigidmd.units import GRAM_PER_CM3
+
+
+@dataclass(frozen=True)
+class Mean:
+    """Where the mean of a quantity over a stage is shown, with its error.
+
+    key : in summary.json, with {} where the key of the error has "_error"
+    unit : where it is not the unit of the samples
+    title : of its row in the full report; None for no row. Means with the same title are one row,
+        each after its `label`
+    short : the same in the short report, by default the title without a label
+    digits : decimals of a mean without an error, `short_digits` in the short report
+    set_point : key of the set point in summary.json
+    order : in summary and reports
+    per_molecule : whether the sum over all molecules is divided by their number
+    header : in the table of a sweep, where it is not the header of the samples; `brief` where the
+        table is printed
+    is_main : whether that table has it where it is printed and drawn
+    """
+
+    key: str
+    title: str | None = None
+    unit: str = ""
+    label: str = ""
+    short: str = ""
+    digits: int = 3
+    short_digits: int | None = None
+    set_point: str = ""
+    order: int = 9
+    per_molecule: bool = False
+    header: str = ""
+    brief: str = ""
+    is_main: bool = False
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity, one value for each sample.
+
+    header : in the file of samples; empty for one that is not written
+    unit : "1" for plain numbers, empty for text
+    of : its value for an `engines.observables.Observation`. Default: the attribute of its name
+    is_averaged : whether its mean has a meaning
+    of_tensor : whether log.csv has it on request, and pressure_tensor.csv has it
+    of_box : whether its mean is shown of stages that change the box only
+    mean : where its mean is shown. If it `is_averaged` no mean, the rate at which it drifts
+    """
+
+    name: str  # in Python
+    header: str
+    unit: str
+    about: str
+    of: Callable[..., float | str] | None = None
+    is_averaged: bool = True
+    of_tensor: bool = False
+    of_box: bool = False
+    mean: Mean | None = None
+
+    @property
+    def mean_header(self) -> str:
+        """The header of its mean in the table of a sweep."""
+        return (self.mean and self.mean.header) or self.header
+
+    def value(self, observation: object) -> float | str:
+        return self.of(observation) if self.of else getattr(observation, self.name)
+
+
+def energy_of_force(name: str) -> Quantity:
+    """The energy of a user-defined force."""
+    return Quantity(
+        name,
+        f"{name} (kJ/mole)",
+        "kJ/mol",
+        f"energy of the force {name}",
+        lambda o: o.energies[name] / o.energy_unit,
+    )
+
+
+def restrained_distance(k: object, of: Callable[..., float] | None = None) -> Quantity:
+    """The distance that fields.restraints.k restrains."""
+    about = f"distance of the groups of fields.restraints.{k}"
+    return Quantity(f"distance_{k}", f"Distance {k} (A)", "Å", about, of)
+
+
+def _edge(name: str, k: int) -> Quantity:
+    about = f"length of the box's edge {name}"
+    return Quantity(
+        name,
+        f"{name} (A)",
+        "Å",
+        about,
+        lambda o: o.edges[k],
+        of_box=True,
+        mean=Mean(f"{name}{{}}_A", "box", label=name),
+    )
+
+
+def _angle(name: str, between: str, k: int) -> Quantity:
+    about = f"angle between {between}"
+    return Quantity(name, f"{name} (deg)", "°", about, lambda o: o.edges[k], of_box=True)
+
+
+def _pressure(axes: str, about: str) -> Quantity:
+    i, j = map("xyz".index, axes)
+    return Quantity(
+        f"pressure_{axes}",
+        f"Pressure {axes} (bar)",
+        "bar",
+        about,
+        lambda o: float(o.pressure_tensor_bar[i, j]),
+        of_tensor=True,
+    )
+
+
+def _volume(o) -> float:
+    return o.state.volume * 1e-3 if o.state.volume < inf else nan
+
+
+def _density(o) -> float:
+    volume = o.state.volume
+    return o.system.mass / volume / GRAM_PER_CM3 if volume < inf else nan
+
+
+def _squares(name: str) -> Callable[..., float]:
+    def of(o) -> float:
+        value = getattr(o.sums, name)
+        return value / o.energy_unit if isfinite(value) else nan
+
+    return of
+
+
+#: Of all scenes, in the order of log.csv, whose first columns are those of OpenMM.
+QUANTITIES = {
+    row.name: row
+    for row in (
+        Quantity(
+            "step",
+            "Step",
+            "1",
+            "steps since the start",
+            lambda o: int(o.state.step[NOW]),
+            is_averaged=False,
+        ),
+        Quantity("time", "Time (ps)", "ps", "time since the start", is_averaged=False),
+        Quantity(
+            "potential",
+            "Potential Energy (kJ/mole)",
+            "kJ/mol",
+            "potential energy of the whole system",
+            mean=Mean(
+                "potential{}_kJ_mol_per_molecule",
+                "potential",
+                "kJ/mol per molecule",
+                short="potential energy",
+                order=3,
+                per_molecule=True,
+                header="Potential Energy per molecule (kJ/mole)",
+                brief="U per molecule (kJ/mol)",
+                is_main=True,
+            ),
+        ),
+        Quantity(
+            "kinetic",
+            "Kinetic Energy (kJ/mole)",
+            "kJ/mol",
+            "kinetic energy, translation and rotation",
+        ),
+        Quantity("energy", "Total Energy (kJ/mole)", "kJ/mol", "potential and kinetic energy"),
+        Quantity(
+            "temperature",
+            "Temperature (K)",
+            "K",
+            "temperature of all motion",
+            mean=Mean(
+                "temperature{}_K",
+                "temperature",
+                digits=2,
+                short_digits=1,
+                set_point="set_temperature_K",
+                order=0,
+                is_main=True,
+            ),
+        ),
+        Quantity(
+            "volume",
+            "Box Volume (nm^3)",
+            "nm³",
+            "volume of the box",
+            _volume,
+            of_box=True,
+        ),
+        Quantity(
+            "density",
+            "Density (g/mL)",
+            "g/cm³",
+            "mass density",
+            _density,
+            of_box=True,
+            mean=Mean("density{}_g_cm3", "density", digits=4, order=5, is_main=True),
+        ),
+        Quantity("stage_name", "Stage", "", "name of the stage", is_averaged=False),
+        Quantity(
+            "temperature_translation",
+            "T_trans (K)",
+            "K",
+            "temperature of translation",
+            mean=Mean(
+                "temperature_translation{}_K",
+                "",
+                label="T_trans",
+                short="  translational",
+                digits=2,
+                short_digits=1,
+                order=1,
+            ),
+        ),
+        Quantity(
+            "temperature_rotation",
+            "T_rot (K)",
+            "K",
+            "temperature of rotation",
+            mean=Mean(
+                "temperature_rotation{}_K",
+                "",
+                label="T_rot",
+                short="  rotational",
+                digits=2,
+                short_digits=1,
+                order=2,
+            ),
+        ),
+        Quantity(
+            "pressure_bar",
+            "Pressure (bar)",
+            "bar",
+            "molecular pressure, with the tail correction and kB T/V of a total momentum that is"
+            " kept at zero",
+            mean=Mean(
+                "pressure{}_bar",
+                "pressure",
+                digits=0,
+                set_point="set_pressure_bar",
+                order=4,
+                is_main=True,
+            ),
+        ),
+        Quantity(
+            "drift",
+            "Drift (kJ/mole)",
+            "kJ/mol",
+            "change of `conserved` since the stage began",
+            lambda o: o.conserved - (o.conserved if o.origin is None else o.origin),
+            is_averaged=False,
+            mean=Mean(
+                "drift{}_kT_ns_per_degree_of_freedom",
+                unit="kT/ns per degree of freedom",
+                short="energy drift",
+                digits=4,
+                header="Drift (kT/ns per degree of freedom)",
+                brief="drift (kT/ns/DOF)",
+                is_main=True,
+            ),
+        ),
+        Quantity(
+            "momentum",
+            "Momentum (u A/ps)",
+            "u Å/ps",
+            "size of the total momentum",
+            lambda o: hypot(*o.sums.momentum.tolist()),
+            is_averaged=False,
+        ),
+        Quantity(
+            "orthogonality_error",
+            "Orthogonality error",
+            "1",
+            "largest entry of abs(QᵀQ - 1)",
+            lambda o: o.sums.orthogonality_error,
+            is_averaged=False,
+        ),
+        _edge("a", 0),
+        _edge("b", 1),
+        _edge("c", 2),
+        _angle("alpha", "b and c", 3),
+        _angle("beta", "c and a", 4),
+        _angle("gamma", "a and b", 5),
+        Quantity(
+            "heat",
+            "Heat (kJ/mole)",
+            "kJ/mol",
+            "heat that thermostats have added since the start",
+            lambda o: float(o.ledger[HEAT]),
+            is_averaged=False,
+        ),
+        Quantity(
+            "work",
+            "Work (kJ/mole)",
+            "kJ/mol",
+            "work of barostats, drives and minimisations so far",
+            lambda o: float(o.ledger[WORK]),
+            is_averaged=False,
+        ),
+        _pressure("xx", "molecular pressure tensor, symmetric part"),
+        *(_pressure(axes, f"the same, {axes}") for axes in ("yy", "zz", "xy", "xz", "yz")),
+        Quantity(
+            "conserved",
+            "",
+            "kJ/mol",
+            "energy less heat, work and the energy of removed momentum",
+            is_averaged=False,
+        ),
+        Quantity("stage", "", "1", "index of the stage, from 0", is_averaged=False),
+        Quantity(
+            "force_squares",
+            "F^2/m (kJ/mole/ps^2)",
+            "kJ/mol/ps²",
+            "sum of F²/m of all molecules",
+            _squares("force"),
+            is_averaged=False,
+        ),
+        Quantity(
+            "torque_squares",
+            "n^2/I (kJ/mole/ps^2)",
+            "kJ/mol/ps²",
+            "the same of torques n",
+            _squares("torque"),
+            is_averaged=False,
+        ),
+    )
+}
+
+
+def with_means(described: Mapping[str, Quantity] = QUANTITIES) -> list[tuple[Quantity, Mean]]:
+    """The quantities whose means are shown, in the order of summary and reports."""
+    rows = [(row, row.mean) for row in described.values() if row.mean]
+    return sorted(rows, key=lambda pair: pair[1].order)
