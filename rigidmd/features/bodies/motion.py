@@ -1,6 +1,7 @@
 """The motion of a single body: the columns of motion.csv, with the errors of the conserved
 quantities."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -29,6 +30,10 @@ class Family(NamedTuple):
     about: str
 
 
+def _named(pattern: str, parts: Iterable[str]) -> tuple[str, ...]:
+    return tuple(map(pattern.format, parts))
+
+
 FAMILIES = {
     "time": Family(("time",), "s", "time"),
     "position": Family(("x", "y", "z"), "m", "centre of mass"),
@@ -43,22 +48,16 @@ FAMILIES = {
     ),
     "euler_angles": Family(("phi", "theta", "psi"), "rad", "Q as Euler angles, 3-1-3"),
     "h_body": Family(
-        tuple(f"h_body_{k}" for k in (1, 2, 3)), "kg m²/s", "angular momentum of wheels, body axes"
+        _named("h_body_{}", "123"), "kg m²/s", "angular momentum of wheels, body axes"
     ),
-    "omega_body": Family(
-        tuple(f"omega_body_{k}" for k in (1, 2, 3)), "rad/s", "angular velocity, body axes"
-    ),
-    "omega_lab": Family(
-        tuple(f"omega_lab_{k}" for k in "xyz"), "rad/s", "angular velocity, lab axes"
-    ),
+    "omega_body": Family(_named("omega_body_{}", "123"), "rad/s", "angular velocity, body axes"),
+    "omega_lab": Family(_named("omega_lab_{}", "xyz"), "rad/s", "angular velocity, lab axes"),
     "L_body": Family(
-        tuple(f"L_body_{k}" for k in (1, 2, 3)),
+        _named("L_body_{}", "123"),
         "kg m²/s",
         "angular momentum with wheels, body axes",
     ),
-    "L_lab": Family(
-        tuple(f"L_lab_{k}" for k in "xyz"), "kg m²/s", "angular momentum with wheels, lab axes"
-    ),
+    "L_lab": Family(_named("L_lab_{}", "xyz"), "kg m²/s", "angular momentum with wheels, lab axes"),
     "kinetic": Family(
         ("kinetic",), "J", "kinetic energy of I omega. Less Omega · J in a rotating frame"
     ),
@@ -69,7 +68,7 @@ FAMILIES = {
         ("energy_error",), "1", "change of energy - work, relative to the largest kinetic energy"
     ),
     "L_error": Family(
-        tuple(f"L_{k}_error" for k in ("lab", "size", *"xyz123")),
+        _named("L_{}_error", ("lab", "size", *"xyz123")),
         "1",
         "change of L, relative to the largest abs(L)",
     ),

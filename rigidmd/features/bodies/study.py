@@ -8,7 +8,7 @@ import numpy as np
 from rigidmd.core.integrators import SOLVERS
 from rigidmd.core.toml import Json
 from rigidmd.features.bodies.keys.body import BodyScene
-from rigidmd.features.bodies.motion import COLUMNS
+from rigidmd.features.bodies.motion import COLUMNS, FAMILIES
 from rigidmd.features.bodies.system import BodySystem
 from rigidmd.features.studies.kind_study import AccuracyStart, KindStudy, Measured
 from rigidmd.run.record import Record
@@ -16,9 +16,12 @@ from rigidmd.run.record import Record
 if TYPE_CHECKING:
     from rigidmd.features.studies.stability.cases import Trial
 
-#: Columns that are not in the table of a sweep; nor are the entries of Q and of the quaternion.
-NOT_IN_TABLE = ("time", "orthogonality_error")
-OF_ROTATION = ("q1", "q2", "q3", "qw", "qx", "qy", "qz")
+#: Columns that are not in the table of a sweep.
+NOT_IN_TABLE = {
+    name
+    for family in ("time", "rotation", "quaternion", "orthogonality_error")
+    for name in FAMILIES[family].names
+}
 RADIANS = 0.1  # rotation per force evaluation in the middle of the ladder of time steps, rad
 #: Step of a body that does not rotate, in the step of its scene, which is assumed to be suitable
 AT_REST = 8.0
@@ -36,7 +39,7 @@ class BodyStudy(KindStudy[BodyScene]):
     def summarise(self, record: Record[BodySystem]) -> dict[str, Measured]:
         results: dict[str, Measured] = {}
         for name, values in record.columns.items():
-            if name in NOT_IN_TABLE or name[:2] in OF_ROTATION or not np.isfinite(values).all():
+            if name in NOT_IN_TABLE or not np.isfinite(values).all():
                 continue
             if name.endswith("_error"):
                 results[f"{name} largest"] = float(np.abs(values).max()), None
