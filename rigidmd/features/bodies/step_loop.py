@@ -172,7 +172,7 @@ def compute_body_load(terms, state, load):
 
 @implements(compute_load)
 def _compute_load(terms, state, load, which):
-    """Of a tuple of terms, the forces only."""
+    """The forces of a tuple of terms, without energies."""
     if is_a(terms, TermTable):
         return None
     return lambda terms, state, load, which: compute_body_load(terms, state, load)

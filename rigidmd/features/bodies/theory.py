@@ -15,8 +15,8 @@ SQUARE_ROOT_OF_ROUNDING = 1e-8
 
 def complete_integral(complement: float, p: float = 1.0) -> float:
     """The complete elliptic integral of the third kind, Π(n, m) with m = 1 - `complement` and n = 1
-    - p, by Bulirsch's algorithm (Numerische Mathematik 13, 305, 1969). By default K(m), that of the
-    first kind. Infinite unless both arguments are positive.
+    - p, by Bulirsch's algorithm (Numerische Mathematik 13, 305, 1969). By default the integral of
+    the first kind, K(m). Infinite unless both arguments are positive.
 
     SciPy has it too, and takes longer to import than a top to run.
     """
