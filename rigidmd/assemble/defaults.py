@@ -185,20 +185,12 @@ def without_tail_reason(scene: MolecularScene, composition: Composition) -> str:
         return "molecules touch beyond the cutoff"
     if switches_cores(forces, shortest_contact(composition.species)):
         return "the switch begins where molecules overlap"
-    if not is_homogeneous(composition):
+    # A slab or a droplet leaves a part of an edge without any centre of mass, longer than two
+    # distances between neighbours.
+    space, position = composition.space, composition.position
+    if longest_gaps(space, position).max() > 2 * (space.volume / len(position)) ** (1 / 3):
         return "the molecules do not fill the box evenly"
     return ""
-
-
-def is_homogeneous(composition: Composition) -> bool:
-    """Whether molecules fill a periodic box evenly. A slab or a droplet leaves a part of an edge
-    without any centre of mass, longer than two distances between neighbours, (V/n)^(1/3)."""
-    space, position = composition.space, composition.position
-    if space.volume == inf:
-        return False
-    return bool(
-        longest_gaps(space, position).max() <= 2 * (space.volume / len(position)) ** (1 / 3)
-    )
 
 
 def electrostatics_module(forces: Forces) -> ModuleType | None:

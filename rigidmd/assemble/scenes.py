@@ -3,7 +3,6 @@
 The atoms of such a scene are an embedded structure file, extended XYZ with every digit.
 """
 
-import os
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Unpack
@@ -19,7 +18,6 @@ from rigidmd.formats.through_ase import NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS, a
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.base import with_absolute_paths
 from rigidmd.scene.molecules import Settings
-from rigidmd.scene.species import SPECIES_FILES
 
 if TYPE_CHECKING:
     import ase
@@ -182,18 +180,11 @@ def models_with_absolute_paths(
 ) -> list[Json]:
     """Tables [[molecules]] of models, with absolute paths, so that they do not depend on the
     working directory."""
-    entries = []
     models = plain_values(models)
-    for entry in models if isinstance(models, list) else [models]:
-        if isinstance(entry, dict):
-            paths = {
-                key: os.path.abspath(path)
-                for key in SPECIES_FILES
-                if isinstance(path := entry.get(key), str)
-            }
-            entries.append(entry | paths)
-        elif isinstance(entry, str) and entry.endswith(".toml"):
-            entries.append({"file": os.path.abspath(entry)})
-        else:
-            entries.append({"model": entry})
-    return entries
+    entries = [
+        entry
+        if isinstance(entry, dict)
+        else {"file" if str(entry).endswith(".toml") else "model": entry}
+        for entry in (models if isinstance(models, list) else [models])
+    ]
+    return with_absolute_paths({"molecules": entries})["molecules"]

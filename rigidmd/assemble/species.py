@@ -92,7 +92,7 @@ def _framework(
     atoms = read_atoms(path)
     if (cell := atoms.cell) is None:
         raise StructureError(str(path), ["has no cell to repeat"])
-    steps = np.stack(np.meshgrid(*map(np.arange, repeat), indexing="ij"), -1).reshape(-1, 3) @ cell
+    steps = np.indices(repeat).reshape(3, -1).T @ cell
     repeated = tuple(
         site.model_copy(update={"position_A": tuple(not_none(site.position_A) + step)})
         for step in steps

@@ -229,9 +229,7 @@ def _start_lattice(
         raise SceneError(scene.source, errors)
     edges = high - low
     shape = _lattice_shape(edges, n)
-    points = np.stack(np.meshgrid(*(np.arange(k) for k in shape), indexing="ij"), axis=-1).reshape(
-        -1, 3
-    )
+    points = np.indices(shape).reshape(3, -1).T
     return low + (points[rng.permutation(len(points))[:n]] + 0.5) * edges / shape
 
 

@@ -161,7 +161,7 @@ def with_reduced_cell(
 def _repeated(configuration: Configuration, repeat: tuple[int, int, int]) -> Configuration:
     """The cell and its molecules, repeated along each edge."""
     cell = not_none(configuration.cell)
-    shifts = np.stack(np.meshgrid(*map(np.arange, repeat), indexing="ij"), -1).reshape(-1, 3) @ cell
+    shifts = np.indices(repeat).reshape(3, -1).T @ cell
 
     def tiled(values):
         return None if values is None else np.tile(values, (len(shifts), *[1] * (values.ndim - 1)))

@@ -219,16 +219,10 @@ def step_warnings(scene: MolecularScene) -> list[str]:
             )
             advice = "Use truncation = 'smooth_switch'"
             warnings.append(f"stages.{k}: {stage.integrator} has order {order}, {lost}. {advice}")
-    return [*warnings, *_sentences_on_steps(scene, _step_warning)]
+    return [*warnings, *sentences_on_steps(scene, _step_warning)]
 
 
-def accuracy_warnings(scene: MolecularScene) -> list[str]:
-    """Those of `step_warnings` on steps that are stable and inaccurate, which a run does not
-    notice."""
-    return [*_sentences_on_steps(scene, _accuracy_warning)]
-
-
-def _sentences_on_steps(
+def sentences_on_steps(
     scene: MolecularScene, about: Callable[[Stage, FastMotion, float], str]
 ) -> Iterator[str]:
     """What a function writes on the step of each stage, if the scene watches steps."""
@@ -254,7 +248,7 @@ def _step_warning(stage: Stage, fastest: FastMotion, temperature: float) -> str:
             f" {dt / time * size:.2g} {unit} (rms); {stage.integrator} is stable up to {limit}"
             f" where, as in liquids, the stiffest motions swing by {size:g} {unit}"
         )
-    if sentence := _accuracy_warning(stage, fastest, temperature):
+    if sentence := accuracy_warning(stage, fastest, temperature):
         return sentence
     if longest < inf and dt * NEEDLESS < longest:
         cause = "is it in ps?" if dt * 1000 * NEEDLESS >= longest else "is it in another unit?"
@@ -265,7 +259,7 @@ def _step_warning(stage: Stage, fastest: FastMotion, temperature: float) -> str:
     return ""
 
 
-def _accuracy_warning(stage: Stage, fastest: FastMotion, temperature: float) -> str:
+def accuracy_warning(stage: Stage, fastest: FastMotion, temperature: float) -> str:
     """Like `_step_warning`, of steps that are stable and have large errors."""
     dt = stage.step
     limit = fastest.longest_step(stage)

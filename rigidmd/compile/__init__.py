@@ -10,7 +10,6 @@ from rigidmd.compile.code import (
     Code,
     CompiledTask,
     TaskArguments,
-    call,
     call_blocks,
     compile_together,
     load_arguments,

@@ -314,8 +314,8 @@ class CacheIndex(IndexDataCacheFile):
     def _write(self, path: str, value) -> None:
         content = self._dump(value)
         with self._open_for_write(path) as file:
-            if hasattr(os, "fchmod"):  # whatever the umask, others must not write to it
-                os.fchmod(file.fileno(), os.fstat(file.fileno()).st_mode & ~OTHERS_WRITE)
+            # whatever the umask, others must not write to it
+            os.fchmod(file.fileno(), os.fstat(file.fileno()).st_mode & ~OTHERS_WRITE)
             file.write(hashlib.sha256(content).digest() + content)
 
     def _read(self, path: str):

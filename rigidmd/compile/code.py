@@ -282,15 +282,6 @@ class BoundTask:
 
 
 @chosen_by_type(inline=True, prefer_literal=True)
-def call(code, name, task_arguments):
-    """Call a task for block 0 by its name, a literal. Arguments of another type are a compilation
-    error."""
-    return lambda code, name, task_arguments: thread_pool.call_address(
-        address_of(code, name, task_arguments), task_arguments, 0
-    )
-
-
-@chosen_by_type(inline=True, prefer_literal=True)
 def call_blocks(code, name, task_arguments, blocks):
     """Call a task for every block; on all threads if there are several blocks."""
 

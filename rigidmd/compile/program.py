@@ -81,7 +81,7 @@ class Program:
         return [one for one in passes if one.when & self._uses]
 
 
-@kernel
+@kernel(from_python=True)
 def run_row(rows, k):
     """Call pass k; returns its status."""
     rows.status[0] = 0

@@ -2,15 +2,14 @@
 its parent process.
 
 The parent holds the other end of the standard input. When it has died, in any way, that input ends,
-and this process gets SIGTERM, on Windows Ctrl-Break: a run then stops with a checkpoint.
+and this process gets SIGTERM: a run then stops with a checkpoint.
 """
 
 import os
 import runpy
+import signal
 import sys
 import threading
-
-from rigidmd.core.signals import stop_this_process
 
 
 def main() -> None:
@@ -22,7 +21,7 @@ def main() -> None:
 def _end_with_parent() -> None:
     while os.read(0, 4096):
         pass
-    stop_this_process()
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 if __name__ == "__main__":

@@ -7,8 +7,6 @@ import os
 import re
 import secrets
 import stat
-import sys
-import time
 import zlib
 from collections.abc import Iterator, Sequence
 from math import inf
@@ -17,12 +15,8 @@ from pathlib import Path
 from rigidmd.errors import OutputError
 
 CHUNK = 1 << 20  # bytes read at a time
-#: Attempts to replace a file that another program holds open, and the pause between them (s), on
-#: Windows.
-REPLACE_ATTEMPTS, REPLACE_PAUSE = 20, 0.1
-#: Flags to open an existing file for appending. Links are not followed, where the system supports
-#: that.
-APPEND_FLAGS = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+#: Flags to open an existing file for appending. Links are not followed.
+APPEND_FLAGS = os.O_RDWR | os.O_NOFOLLOW
 
 
 def unreadable_reason(path: Path, largest: float = inf) -> str:
@@ -52,10 +46,8 @@ def untrusted_reason(found: os.stat_result) -> str:
     """Why a file or folder may have been written by others than this user and root. Empty if it
     cannot.
 
-    found : of `os.lstat` or `os.fstat`. Systems without user numbers have no such check.
+    found : of `os.lstat` or `os.fstat`
     """
-    if sys.platform == "win32":
-        return ""
     if stat.S_ISLNK(found.st_mode):
         return "is a link"
     if found.st_uid not in (os.geteuid(), 0):
@@ -89,20 +81,9 @@ def atomic_file(path: Path) -> Iterator[Path]:
         temporary.touch(exist_ok=False)  # with the permissions of any new file
         try:
             yield temporary
-            _replace(temporary, path)
+            temporary.replace(path)
         finally:
             temporary.unlink(missing_ok=True)
-
-
-def _replace(temporary: Path, path: Path) -> None:
-    """Rename a file over another one. Windows refuses while a program has that one open, such as a
-    virus scanner for a moment."""
-    for _ in range(REPLACE_ATTEMPTS if sys.platform == "win32" else 0):
-        with contextlib.suppress(PermissionError):
-            temporary.replace(path)
-            return
-        time.sleep(REPLACE_PAUSE)
-    temporary.replace(path)
 
 
 def is_temporary(path: Path) -> bool:
@@ -124,10 +105,8 @@ def create_empty_file(path: Path) -> None:
 
 
 def sync_file(path: Path) -> None:
-    """Flush a file or a folder to the disk. On Windows, which opens no folders, a file."""
-    if sys.platform == "win32" and path.is_dir():
-        return
-    handle = os.open(path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
+    """Flush a file or a folder to the disk."""
+    handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:

@@ -3,6 +3,7 @@ Python."""
 
 import contextlib
 import os
+import resource
 import sys
 import threading
 import warnings
@@ -132,10 +133,6 @@ def format_gigabytes(size: float) -> str:
 def address_space_left() -> float:
     """Bytes of address space left by the limit of this process (`ulimit -v`). Infinite without a
     limit."""
-    if sys.platform == "win32":
-        return inf
-    import resource
-
     soft, _ = resource.getrlimit(resource.RLIMIT_AS)
     used = 1024 * _system_number("/proc/self/status", "VmSize:", 0.0)
     return inf if soft == resource.RLIM_INFINITY else soft - used

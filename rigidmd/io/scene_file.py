@@ -1,7 +1,6 @@
 """Writers of TOML: the scene of a run with all defaults and copies of its input files, and a
 molecular model."""
 
-import json
 import re
 import shutil
 from pathlib import Path
@@ -13,7 +12,7 @@ from rigidmd.core.toml import Json, plain_values
 from rigidmd.formats import STRUCTURE
 from rigidmd.io.folder import SCENE
 from rigidmd.scene import Scene, is_molecular
-from rigidmd.scene.base import override
+from rigidmd.scene.base import format_toml, override
 from rigidmd.scene.models import MoleculeFile
 
 
@@ -72,13 +71,4 @@ def write_model(path: Path, model: MoleculeFile) -> None:
 
 
 def _lines(table: Json) -> str:
-    return "\n".join(f"{key} = {_value(value)}" for key, value in table.items())
-
-
-def _value(value: object) -> str:
-    """A text, a number, a list or a table in one line, which TOML writes as JSON except for
-    tables."""
-    if isinstance(value, dict):
-        pairs = [f"{_value(name)} = {_value(inner)}" for name, inner in value.items()]
-        return f"{{ {', '.join(pairs)} }}"
-    return json.dumps(value, ensure_ascii=False)
+    return "\n".join(f"{key} = {format_toml(value)}" for key, value in table.items())

@@ -330,7 +330,8 @@ def _rotate_lanes(constants, about, rotation, angular_momentum_body, first, mome
         L1, L2, q1, q2, q4, q5, q7, q8 = _rotate_about_axis(
             angle, sign, L1, L2, q1, q2, q4, q5, q7, q8
         )
-    x, y, z = _from_rotor_axes((L0, L1, L2), axes)
+    transposed = (axes[0], axes[2], axes[1], axes[3])
+    x, y, z = _to_rotor_axes((L0, L1, L2), transposed)
     # its momentum is kept, with the signs of zeros
     unchanged = load(constants, RATE * LANES) == 0.0
     unchanged = (
@@ -345,34 +346,23 @@ def _rotate_lanes(constants, about, rotation, angular_momentum_body, first, mome
     )
     store_vectors(angular_momentum_body, first, kept)
     back = (
-        _from_rotor_axes((q0, q1, q2), axes)
-        + _from_rotor_axes((q3, q4, q5), axes)
-        + _from_rotor_axes((q6, q7, q8), axes)
+        _to_rotor_axes((q0, q1, q2), transposed)
+        + _to_rotor_axes((q3, q4, q5), transposed)
+        + _to_rotor_axes((q6, q7, q8), transposed)
     )
     store_matrices(rotation, first, back)
 
 
 @kernel(inline=True)
 def _to_rotor_axes(vector, axes):
-    """Components of a body vector along the rotor's axes a, b, c."""
+    """Components of a body vector along the rotor's axes a, b, c, or with the transposed axes the
+    body vector of such components."""
     x, y, z = vector
     a_is_x, b_is_x, a_is_y, b_is_y = axes
     return (
         select(a_is_x, x, select(a_is_y, y, z)),
         select(b_is_x, x, select(b_is_y, y, z)),
         select(a_is_x | b_is_x, select(a_is_y | b_is_y, z, y), x),
-    )
-
-
-@kernel(inline=True)
-def _from_rotor_axes(vector, axes):
-    """A body vector from its components along the rotor's axes a, b, c."""
-    a, b, c = vector
-    a_is_x, b_is_x, a_is_y, b_is_y = axes
-    return (
-        select(a_is_x, a, select(b_is_x, b, c)),
-        select(a_is_y, a, select(b_is_y, b, c)),
-        select(a_is_x | a_is_y, select(b_is_x | b_is_y, c, b), a),
     )
 
 

@@ -132,21 +132,6 @@ def angular_velocity_of_euler_rates(euler_angles: np.ndarray, rates: np.ndarray)
     return np.stack(np.broadcast_arrays(*omega), axis=-1)
 
 
-def euler_rates(euler_angles: np.ndarray, angular_velocity_body: np.ndarray) -> np.ndarray:
-    """Time derivatives (..., 3) of the 3-1-3 angles (..., 3) of a body that rotates with omega
-    (..., 3), body frame. Raises ValueError where sin(theta) is 0 to rounding."""
-    (_, ct, cp), (_, st, sp) = _cosines_and_sines(euler_angles)
-    if np.any(np.abs(st) <= 4 * np.finfo(float).eps):
-        raise ValueError(
-            "the rates of the 3-1-3 Euler angles are singular at theta = 0 and theta = pi (sin"
-            " theta = 0), where phi and psi rotate about the same axis. Use the angular velocity"
-            " instead"
-        )
-    w1, w2, w3 = np.moveaxis(np.asarray(angular_velocity_body, dtype=float), -1, 0)
-    phi_dot = (w1 * sp + w2 * cp) / st
-    return np.stack(np.broadcast_arrays(phi_dot, w1 * cp - w2 * sp, w3 - phi_dot * ct), axis=-1)
-
-
 def attitude_matrix(rotation: np.ndarray) -> np.ndarray:
     """T = Q^T (..., 3, 3), the attitude matrix: lab to body, dT/dt = -hat(omega_body) T."""
     return np.swapaxes(np.asarray(rotation, dtype=float), -1, -2).copy()

@@ -324,6 +324,15 @@ def _user_code(system: System) -> str:
     return f"{' or '.join(named)} (the run without it shows whether), or " if named else ""
 
 
+def advice_on_repulsion(system: System, pair: OverlappingPair) -> str:
+    """What to do if no repulsion acts between two opposite charges."""
+    a, b = system.sites.name[[pair.first, pair.second]]
+    return (
+        "Try giving one of these sites sigma_A and epsilon_kJ_mol, or the pair an entry"
+        f' [[forces.pairs]] with sites = ["{a}", "{b}"]'
+    )
+
+
 def _cause(
     system: System,
     failed: FailedCheck,
@@ -340,12 +349,9 @@ def _cause(
     elif failed.factor is not None and failed.factor < 1 / ROUNDING:
         shorter = f"timestep_fs = {dt / failed.factor / FEMTOSECOND:.2g} or less"
     if pair is not None and pair.without_repulsion:
-        a, b = system.sites.name[[pair.first, pair.second]]
         return (
-            "a charge on a site without repulsion has collapsed onto an opposite one. Try giving"
-            " one of these sites "
-            "sigma_A and epsilon_kJ_mol, or the pair an entry [[forces.pairs]] with sites ="
-            f' ["{a}", "{b}"]'
+            "a charge on a site without repulsion has collapsed onto an opposite one."
+            f" {advice_on_repulsion(system, pair)}"
         )
     if pair is not None:
         return (

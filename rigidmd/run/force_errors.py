@@ -17,7 +17,6 @@ from rigidmd.forces.ewald.errors import (
     filled_fraction,
     left_out_error,
     pme_error,
-    real_error,
 )
 from rigidmd.forces.ewald.smooth import InverseR, Smooth
 from rigidmd.forces.neighbors.pair_loop import PairForces
@@ -117,7 +116,7 @@ def estimated_error(system: System, cell: np.ndarray) -> float:
         reciprocal = pme_error(charges, term.smooth.alpha, cell, term.grid, term.order)
     position = fractions(system.space, system.state.position) @ cell
     filled = filled_fraction(system.species, counts, space_of(cell), position)
-    real = real_error(charges, term.smooth.alpha, cutoff, volume)
+    real = charges.beyond(term.smooth.alpha, cutoff, volume)
     return float(np.hypot(real, reciprocal)) / np.sqrt(filled) * COULOMB
 
 

@@ -495,11 +495,8 @@ def _check_charges(system: System, point: EnthalpyPoint) -> None:
     if pair is None or not pair.without_repulsion:
         return
     a, b = checks.site_labels(system, pair)
-    one, other = system.sites.name[[pair.first, pair.second]]
     raise SimulationError(
         f"the energy has no lower bound: {a} and {b}, of opposite charge, are at"
-        f" {pair.distance:.3g} Å, and no "
-        "repulsion acts between them. Try giving one of these sites sigma_A and epsilon_kJ_mol, or"
-        " the pair an "
-        f'entry [[forces.pairs]] with sites = ["{one}", "{other}"]'
+        f" {pair.distance:.3g} Å, and no repulsion acts between them."
+        f" {checks.advice_on_repulsion(system, pair)}"
     )

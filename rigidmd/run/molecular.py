@@ -13,7 +13,7 @@ from pydantic import PositiveFloat
 from rigidmd.assemble.build import build, integrator_of_stage
 from rigidmd.assemble.harmonic import stable_angle
 from rigidmd.assemble.start import rest_errors
-from rigidmd.assemble.time_step import accuracy_warnings
+from rigidmd.assemble.time_step import accuracy_warning, sentences_on_steps
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import NOW, ORIGIN, REMOVED, State, state_of
@@ -188,7 +188,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         for feature in acting_on(self.scene):
             for note in feature.notes_on_start(self.system, self.state):
                 self.simulation._note(note)
-        for warning in accuracy_warnings(self.scene):
+        for warning in sentences_on_steps(self.scene, accuracy_warning):
             self.simulation._note(warning)
 
     @contextmanager

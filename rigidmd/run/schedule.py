@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import NamedTuple, SupportsIndex
 
 from rigidmd.core.integrators import Scheme, Solver
-from rigidmd.core.signals import CHECKPOINT_SIGNALS, STOP_SIGNAL, has_handler
+from rigidmd.core.signals import STOP_SIGNAL, has_handler
 from rigidmd.io.checkpoint import Checkpoint, write_checkpoint
 from rigidmd.run.observers import Observer, above_zero
 from rigidmd.scene.validation import number_of_steps
@@ -158,14 +158,13 @@ def signal_handler(handler: Callable[[int], None], *numbers: int) -> Iterator[No
 
 
 def stop_signals() -> list[int]:
-    """The signals that end runs: Ctrl-C, and SIGTERM (on Windows Ctrl-Break) unless the program
-    handles it."""
+    """The signals that end runs: Ctrl-C, and SIGTERM unless the program handles it."""
     return [signal.SIGINT, *([] if has_handler(STOP_SIGNAL) else [STOP_SIGNAL])]
 
 
 def checkpoint_signals() -> list[int]:
     """The signals that request a checkpoint, unless the program handles them."""
-    return [number for number in CHECKPOINT_SIGNALS if not has_handler(number)]
+    return [] if has_handler(signal.SIGUSR1) else [signal.SIGUSR1]
 
 
 #: Seconds until a Ctrl-C is repeated that came where Python ignores exceptions.

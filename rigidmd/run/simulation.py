@@ -393,10 +393,6 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         self._before_run().prepare()
         self._part.reset()
 
-    def _take_threads(self, count: int) -> None:
-        """Set the number of threads. Results do not depend on it."""
-        self._before_run().take_threads(count)
-
     def _start_energy(
         self, size: float = 1.0, unit: str = "J", *, measure_accuracy: bool = False
     ) -> Json:
@@ -568,7 +564,7 @@ def run_together(
         raise ValueError("a simulation is given twice. Make one for each run")
     jobs = MOST_THREADS if jobs is None else checked_count(jobs, "jobs")
     for simulation in simulations:
-        simulation._take_threads(1)
+        simulation._before_run().take_threads(1)
     begun: list[Simulation] = []
     received: list[int] = []  # the signals that end runs, so far
 

@@ -538,10 +538,10 @@ def parse_override(text: str) -> tuple[str, object]:
 
 def format_override(key: str, value: object) -> str:
     """KEY=VALUE of the command line, which `parse_override` reads as this value."""
-    return f"{key}={_format_toml(value)}"
+    return f"{key}={format_toml(value)}"
 
 
-def _format_toml(value: object) -> str:
+def format_toml(value: object) -> str:
     """A value in one line of TOML. Empty for None."""
     match value:
         case None:
@@ -551,8 +551,8 @@ def _format_toml(value: object) -> str:
         case str():
             return json.dumps(value, ensure_ascii=False)
         case list() | tuple():
-            return f"[{', '.join(map(_format_toml, value))}]"
+            return f"[{', '.join(map(format_toml, value))}]"
         case Mapping():
-            pairs = (f"{json.dumps(key)} = {_format_toml(part)}" for key, part in value.items())
+            pairs = (f"{json.dumps(key)} = {format_toml(part)}" for key, part in value.items())
             return f"{{{', '.join(pairs)}}}"
     return repr(value)

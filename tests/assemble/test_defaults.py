@@ -19,7 +19,7 @@ from rigidmd.assemble.time_step import MARGIN, MIXED_ERROR, _one_digit, error_of
 from rigidmd.commands.cli import main
 from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
 from rigidmd.errors import SceneError
-from rigidmd.forces.ewald.errors import charges_in, pme_error, real_error
+from rigidmd.forces.ewald.errors import charges_in, pme_error
 from rigidmd.run.force_errors import coulomb_errors
 from rigidmd.run.kind import describe
 from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
@@ -244,7 +244,7 @@ def test_the_accuracy_is_better_than_the_defaults_of_gromacs_and_openmm():
     grids = (42, 42, 42), (45, 45, 45)  # ceil(2 alpha L/(3 tolerance^(1/5))) of OpenMM
     errors = [
         np.hypot(
-            real_error(charges, alpha, cutoff, volume), pme_error(charges, alpha, cell, grid, order)
+            charges.beyond(alpha, cutoff, volume), pme_error(charges, alpha, cell, grid, order)
         )
         for alpha, grid, order in zip(alphas, grids, (4, 5), strict=True)
     ]

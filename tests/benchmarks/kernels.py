@@ -29,11 +29,10 @@ from scipy.spatial import cKDTree
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from rigidmd import Scene, Simulation
-from rigidmd.compile import SIMD_BITS, Rows
+from rigidmd.compile import SIMD_BITS, Rows, run_row
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.state import State
 from rigidmd.engines.cpu.engine import DTYPES, CpuEngine
-from rigidmd.engines.cpu.program import run_single_row
 from rigidmd.forces.neighbors.lists import BUILDS, MASKED, end_of_row, largest_displacement
 from rigidmd.forces.neighbors.pair_loop import PairWorkspace
 from rigidmd.forces.neighbors.sites import compute_site_positions
@@ -118,9 +117,7 @@ def measure(job: dict) -> dict:
     builds = {name: number - builds[name] for name, number in builds_of(engine).items()}
 
     rows, parts = engine.rows_of_steps(), parts_of(engine, state)
-    calls = [
-        [milliseconds(run_single_row, rows, part.row) for part in parts] for _ in range(1 + CALLS)
-    ]
+    calls = [[milliseconds(run_row, rows, part.row) for part in parts] for _ in range(1 + CALLS)]
     pairs, times = [], []
     for part, spent in zip(parts, np.min(calls[1:], axis=0).tolist(), strict=True):
         term = engine.workspaces[part.term]
@@ -149,7 +146,7 @@ def shortest_build(term: PairWorkspace, rows: Rows, k: int) -> float:
     taken = []
     for _ in range(CALLS):
         term.renew_list()
-        taken.append(milliseconds(run_single_row, rows, k))
+        taken.append(milliseconds(run_row, rows, k))
     return min(taken)
 
 

@@ -64,7 +64,7 @@ def data(name: str, duration: float, seed: int = 1) -> dict:
 def bare_speed(name: str, seconds: float) -> float:
     """Steps per second of the engine alone on one core, from a state that has come to rest."""
     simulation = Simulation(Scene.from_dict(data(name, TO_REST)))
-    simulation._take_threads(1)
+    simulation._before_run().take_threads(1)
     state = simulation.run().state.copy()
     engine, scheme = simulation.engine, row(simulation.system, 0)
 

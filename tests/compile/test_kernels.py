@@ -18,7 +18,6 @@ from support.thread_kernels import add
 
 from rigidmd.compile import (
     Code,
-    call,
     call_blocks,
     kernel,
     pack_arguments,
@@ -167,13 +166,13 @@ class Content(NamedTuple):
 
 @kernel(from_python=True)
 def add_once_and_in_blocks(content, blocks):
-    call(content.code, "add", pack_arguments((content.values, 1.0)))
+    call_blocks(content.code, "add", pack_arguments((content.values, 1.0)), 1)
     call_blocks(content.code, "add", pack_arguments((content.values, 2.0)), blocks)
 
 
 @kernel(from_python=True)
 def call_what_is_not_there(content):
-    call(content.code, "subtract", pack_arguments((content.values, 1.0)))
+    call_blocks(content.code, "subtract", pack_arguments((content.values, 1.0)), 1)
 
 
 def content_of(values):

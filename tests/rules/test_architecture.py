@@ -68,9 +68,7 @@ LIBRARIES = {
     "tomli_w": {"io/scene_file.py"},
 }
 
-FILES = sorted(
-    path for path in PACKAGE.rglob("*.py") if "docs" not in path.parts
-)  # docs: hooks of the site
+FILES = sorted(PACKAGE.rglob("*.py"))
 
 
 def name_of(path):

@@ -141,10 +141,9 @@ def has_logic(path: Path) -> bool:
 
 
 def module_names() -> dict[str, Path]:
-    """The modules below rigidmd/, without the extension. The scripts of the site are left out."""
+    """The modules below rigidmd/, without the extension."""
     paths = (path for path in sorted(PACKAGE.rglob("*.py")) if not path.stem.startswith("__"))
-    names = {path.relative_to(PACKAGE).with_suffix("").as_posix(): path for path in paths}
-    return {name: path for name, path in names.items() if not name.startswith("docs/")}
+    return {path.relative_to(PACKAGE).with_suffix("").as_posix(): path for path in paths}
 
 
 def has_file_of_its_name(module: str) -> bool:

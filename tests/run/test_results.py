@@ -438,7 +438,7 @@ def test_steps_are_the_steps_of_a_run(make, tmp_path):
     assert simulation.step() == 1 and simulation.state.step[0] == 1
     assert seen[0] == 0 and seen[-1] <= 1
     with pytest.raises(RuntimeError, match="the run has begun"):
-        simulation._take_threads(1)
+        simulation._before_run().take_threads(1)
     with pytest.raises(OutputError, match="another run is writing"):
         make(tmp_path / "steps", force=True).run()
     assert simulation.step(7) == 7
@@ -742,7 +742,7 @@ def test_a_simulation_shows_what_is_for_users():
 
 
 def test_the_reference_has_class_methods_cached_properties_and_code(monkeypatch):
-    monkeypatch.syspath_prepend(ROOT / "rigidmd" / "docs" / "site")
+    monkeypatch.syspath_prepend(ROOT / ".ci" / "site")
     import api
 
     page = api.page()

@@ -8,7 +8,7 @@ energy added to the molecules is in `state.energy_ledger[WORK]`.
 """
 
 from math import exp, log
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -87,20 +87,6 @@ def barostat_workspace(state: State) -> BarostatWorkspace:
         np.zeros(1, np.int64),
         np.zeros(2, np.int64),
     )
-
-
-class Barostat(Protocol):
-    """The record of a barostat, a NamedTuple."""
-
-    @property
-    def forces(self) -> int:
-        """What each evaluation of forces computes: FORCES_ONLY or WITH_VIRIALS."""
-        ...
-
-    def rows(self, parts: StepParts, timing: Timing) -> list[Pass]:
-        """Its flow in a step. What `forces` computes is known before it, and energies and virials
-        where this is FORCES_ONLY."""
-        ...
 
 
 @kernel(inline=True)

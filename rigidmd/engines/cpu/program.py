@@ -5,18 +5,12 @@ import time
 from statistics import median
 from typing import NamedTuple
 
-from rigidmd.compile import kernel, run_row
+from rigidmd.compile import run_row
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import State, no_load
 from rigidmd.dynamics.step_table import StepTable
 from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.forces.terms import FORCES_ONLY, WITH_ENERGIES
-
-
-@kernel(from_python=True)
-def run_single_row(rows, k):
-    """`run_row` for Python, which measures the time of a pass."""
-    return run_row(rows, k)
 
 
 class Row(NamedTuple):
@@ -77,7 +71,7 @@ def profile_of(engine: CpuEngine, state: State, scheme: Scheme, dt: float) -> Pr
             load[:] = 0.0
         for k in used:
             began = time.perf_counter()
-            run_single_row(rows, k)
+            run_row(rows, k)
             times[k].append(time.perf_counter() - began)
     step = median(steps)
     times_of_passes = [(texts[k], median(spent)) for k, spent in times.items()]

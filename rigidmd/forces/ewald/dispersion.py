@@ -19,7 +19,6 @@ from rigidmd.forces.ewald.errors import (
     k_cutoff_for,
     pme_error,
     pme_grid_for,
-    real_error,
 )
 from rigidmd.forces.ewald.smooth import InverseR6
 from rigidmd.forces.neighbors.space import cell_of
@@ -155,9 +154,7 @@ def interactions(parts: SystemParts) -> Interactions:
         "dispersion_intramolecular": inside,
     }
     error = (
-        np.hypot(k_space, real_error(dispersing, beta, cutoff, volume))
-        / sqrt(parts.filled)
-        / KJ_PER_MOL
+        np.hypot(k_space, dispersing.beyond(beta, cutoff, volume)) / sqrt(parts.filled) / KJ_PER_MOL
     )
     note = (
         f"dispersion by {forces.dispersion}: beta {beta:.6g} 1/Å, {how}. "

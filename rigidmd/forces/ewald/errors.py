@@ -126,21 +126,16 @@ def charges_in(
     return kind(count, square, tuple(zip(sums[order].tolist(), rounded, strict=True)))
 
 
-def real_error(charges: Charges, alpha: float, cutoff: float, volume: float) -> float:
-    """Error from the pairs beyond the cutoff."""
-    return charges.beyond(alpha, cutoff, volume)
-
-
 def alpha_for(charges: Charges, cutoff: float, volume: float, error: float) -> float:
     """The alpha (1/Å) at which the pairs beyond the cutoff cause this error."""
     if isinstance(charges, Dispersing):
         low, high = 0.5, MAX_ALPHA_CUTOFF + 1e-3
         while high - low > 1e-6:
             middle = 0.5 * (low + high)
-            is_less = real_error(charges, middle / cutoff, cutoff, volume) <= error
+            is_less = charges.beyond(middle / cutoff, cutoff, volume) <= error
             low, high = (low, middle) if is_less else (middle, high)
         return high / cutoff
-    unscreened_error = real_error(charges, 0.0, cutoff, volume)
+    unscreened_error = charges.beyond(0.0, cutoff, volume)
     # a large error allows almost no screening; the formula holds for alpha cutoff down to 1/2
     return max(0.5, sqrt(max(0.0, np.log(unscreened_error / error)))) / cutoff
 

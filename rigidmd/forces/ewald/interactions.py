@@ -19,7 +19,6 @@ from rigidmd.forces.ewald.errors import (
     left_out_error,
     pme_error,
     pme_grid_for,
-    real_error,
 )
 from rigidmd.forces.ewald.smooth import InverseR
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
@@ -198,7 +197,7 @@ def _errors(parts: SystemParts) -> tuple[float, float, direct_sum.KVectors | Non
     assert alpha is not None and cutoff is not None  # they are defaults, or keys of the scene
     charges = charges_in(parts.species, parts.counts)
     real, reciprocal = (
-        real_error(charges, alpha, cutoff, volume),
+        charges.beyond(alpha, cutoff, volume),
         2 * pi * np.linalg.inv(cell).T,
     )
     if parts.grid is not None:

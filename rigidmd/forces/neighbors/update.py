@@ -3,7 +3,7 @@ valid any longer."""
 
 from math import ceil, floor, inf, sqrt
 
-from rigidmd.compile import Code, call, call_blocks, kernel, load_arguments, pack_arguments, task
+from rigidmd.compile import Code, call_blocks, kernel, load_arguments, pack_arguments, task
 from rigidmd.core.state import CELL_CHANGED, EXAMPLE, LIST_FULL, NOT_FINITE, NOW, OK
 from rigidmd.forces.neighbors.clusters import (
     BUILT,
@@ -93,7 +93,7 @@ def update_list(pairs, code, sites, state):
         pairs.times[LEAD_TIME] = ahead
         call_blocks(code, "wrap", site_arguments, blocks)
         call_blocks(code, "bin", site_arguments, blocks)
-        call(code, "sort", arguments)
+        call_blocks(code, "sort", arguments, 1)
         if pairs.counters[STATUS] == OK:
             call_blocks(code, "origins", site_arguments, blocks)
             call_blocks(code, "local", site_arguments, blocks)
@@ -105,7 +105,7 @@ def update_list(pairs, code, sites, state):
                 break
     if pairs.counters[STATUS] != OK:
         return pairs.counters[STATUS]
-    call(code, "boxes", arguments)
+    call_blocks(code, "boxes", arguments, 1)
     call_blocks(code, "fill", arguments, blocks)
     status = _finish_build(pairs)
     if status == OK:
@@ -126,7 +126,7 @@ def refill(pairs, code):
     restore_half_squares(pairs.clusters)
     _find_images(pairs)
     arguments = pack_arguments(pairs)
-    call(code, "boxes", arguments)
+    call_blocks(code, "boxes", arguments, 1)
     call_blocks(code, "fill", arguments, len(pairs.needed))
     return _finish_build(pairs)
 

@@ -24,7 +24,7 @@ from rigidmd.features.external.force_field import (
 )
 from rigidmd.features.external.openmm.program import PROGRAM
 from rigidmd.features.external.rigid_bodies import MassPoints, Points, RigidBodies, mass_points
-from rigidmd.forces.ewald.errors import charges_in, pme_grid_for, real_error
+from rigidmd.forces.ewald.errors import charges_in, pme_grid_for
 from rigidmd.forces.ewald.pme import Pme
 from rigidmd.forces.neighbors.space import cell_of
 from rigidmd.forces.parts import gather_per_molecule
@@ -64,7 +64,7 @@ def grid_for(view: ForceFieldView, order: int) -> tuple[int, int, int] | None:
     charges = charges_in(
         system.species, np.bincount(system.model.species, minlength=len(system.species))
     )
-    real_space = real_error(charges, potential.alpha, potential.cutoff, system.space.volume)
+    real_space = charges.beyond(potential.alpha, potential.cutoff, system.space.volume)
     error = sqrt(max((system.force_error or 0.0) ** 2 / COULOMB**2 - real_space**2, 0.0))
     grid_and_error = pme_grid_for(charges, potential.alpha, cell_of(system.space), error, order)
     return None if grid_and_error is None else grid_and_error[0]

@@ -22,7 +22,7 @@ from filelock import FileLock, Timeout
 
 from rigidmd.core.files import write_text, writing
 from rigidmd.core.process import BY_SIGNAL, OUT_OF_TIME, python_process
-from rigidmd.core.signals import KILL_SIGNAL, SEPARATE_GROUP, STOP_SIGNAL, stop_process
+from rigidmd.core.signals import SEPARATE_GROUP, STOP_SIGNAL
 from rigidmd.errors import OutputError, RigidMDError, SettingError, describe_error, option
 from rigidmd.features import provider
 from rigidmd.features.studies.sweep.folder import Manifest, SweepPoint
@@ -120,7 +120,7 @@ def run_point(point: SweepPoint, common: CommonSettings) -> tuple[int, float]:
         while process.poll() is None:
             requested = _requested_signal(outputs)
             if requested != sent:
-                process.kill() if requested == KILL_SIGNAL else stop_process(process)
+                process.kill() if requested == signal.SIGKILL else process.terminate()
                 sent = requested
             with suppress(subprocess.TimeoutExpired):
                 process.wait(POLL_INTERVAL)
@@ -219,7 +219,7 @@ def run_points(
             if signals.count(signal.SIGINT) > 2:  # a cluster may not answer
                 raise KeyboardInterrupt
             at_once = signals.count(signal.SIGINT) > 1
-            write_text(outputs / STOP, str(int(KILL_SIGNAL if at_once else STOP_SIGNAL)))
+            write_text(outputs / STOP, str(int(signal.SIGKILL if at_once else STOP_SIGNAL)))
 
         alone = replace(manifest, points=[])
         alone.folder = folder
@@ -298,7 +298,7 @@ def _record_end(
 
 def _failure_reason(lines: list[str], code: int) -> str:
     """Why a process has failed, by its output: the last message, or else the last line."""
-    if code == -KILL_SIGNAL:
+    if code == -signal.SIGKILL:
         advice = f"run fewer points at a time: {option('jobs')}"
         return f"its process was killed, perhaps because memory was full ({advice})"
     last = "\n".join(lines[-1:])
