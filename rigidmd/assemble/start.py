@@ -229,7 +229,7 @@ def _start_lattice(
         raise SceneError(scene.source, errors)
     edges = high - low
     shape = _lattice_shape(edges, n)
-    points = np.indices(shape).reshape(3, -1).T
+    points = np.indices(shape.tolist()).reshape(3, -1).T
     return low + (points[rng.permutation(len(points))[:n]] + 0.5) * edges / shape
 
 
