@@ -280,6 +280,7 @@ def integrator_of_stage(system: System, k: int) -> Scheme:
 
 
 def thermostat_of(system: System, k: int) -> NamedTuple:
+    """The record of the thermostat of stage k."""
     stage = system.scene.stages[k]
     thermal = _thermal(stage)
     key = noise.key_of(system.scene.seed, noise.THERMOSTAT, k)
@@ -288,6 +289,7 @@ def thermostat_of(system: System, k: int) -> NamedTuple:
 
 
 def barostat_of(system: System, k: int) -> NamedTuple:
+    """The record of the barostat of stage k."""
     stage = system.scene.stages[k]
     key = noise.key_of(system.scene.seed, noise.BAROSTAT, k)
     # the scene lists xy, xz, yz: components (1, 0), (2, 0), (2, 1) of the lower triangle

@@ -244,6 +244,7 @@ def write_study(
 
 
 def print_page(path: Path, notes: list[str]) -> None:
+    """Print notes and how to open a page that was written."""
     for note in notes:
         print(note)
     print(

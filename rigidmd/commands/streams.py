@@ -12,10 +12,12 @@ from rigidmd.errors import OutputError, visible
 
 
 def announce(message: str) -> None:
+    """Say on the standard error what begins."""
     print(f"  {message} ...", file=sys.stderr, flush=True)
 
 
 def warn(message: str) -> None:
+    """Print a warning on the standard error."""
     print(f"rigidmd: warning: {visible(message)}", file=sys.stderr)
 
 

@@ -127,6 +127,7 @@ def memory_shortage(needed: float, what: str) -> str:
 
 
 def format_gigabytes(size: float) -> str:
+    """A number of bytes as text."""
     return f"{size / 1e9:.3g} GB"
 
 

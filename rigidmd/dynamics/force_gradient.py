@@ -29,6 +29,7 @@ class GradientWorkspace(NamedTuple):
 
 
 def gradient_workspace(state: State) -> GradientWorkspace:
+    """Arrays for the force gradient at a state."""
     return GradientWorkspace(
         np.empty_like(state.position),
         np.empty_like(state.rotation),

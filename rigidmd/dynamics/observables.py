@@ -49,6 +49,7 @@ SIZE = np.int64(2**63 - 1)
 
 
 def largest_values(state: State, load: Load = EXAMPLE[1]) -> LargestValues:
+    """The largest absolute values of the arrays of a state and a load."""
     values = np.empty(len(LargestValues._fields))
     arrays = (state.position, state.velocity, state.rotation, state.angular_momentum_body, *load)
     find_largest(*(array.ravel() for array in arrays), values)

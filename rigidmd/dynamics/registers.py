@@ -20,6 +20,7 @@ class Registers(NamedTuple):
 
 
 def new_registers() -> Registers:
+    """Registers in which nothing is known."""
     return Registers(np.zeros(1), *(np.zeros(1, np.int64) for _ in range(3)))
 
 

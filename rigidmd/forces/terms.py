@@ -353,6 +353,7 @@ def copy(source, target):
 
 @kernel
 def total_energy_rate(table):
+    """The rate of change of the potential energy by forces that depend on time, u Å²/ps³."""
     table.power[0] = 0.0
     run_passes(table.rates, table.rates.arguments, ALWAYS)
     return table.power[0]

@@ -84,6 +84,7 @@ def check_names(folder: Path, names: Iterable[str], marker: str = MARKER) -> Non
 
 
 def write_marker(folder: Path, names: Iterable[str], marker: str = MARKER) -> None:
+    """List the files of a run in its folder."""
     write_text(folder / marker, "\n".join(dict.fromkeys(names)) + "\n")
 
 

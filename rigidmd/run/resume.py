@@ -95,6 +95,7 @@ def scene_digest(scene: Scene) -> str:
 
 
 def file_digest(path: Path) -> str:
+    """SHA-256 of the content of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 

@@ -214,6 +214,7 @@ FIELDS = {
 
 
 def field_notes(scene: "MolecularScene") -> list[str]:
+    """Notes on fields that act with the sums over periodic images."""
     method = scene.forces.electrostatics
     if not (scene.fields.walls and method and ELECTROSTATICS[method].sums_images):
         return []

@@ -76,6 +76,7 @@ class BarostatWorkspace(NamedTuple):
 
 
 def barostat_workspace(state: State) -> BarostatWorkspace:
+    """Arrays for the moves of the box of a state."""
     return BarostatWorkspace(
         np.zeros((2, TALLY_SIZE)),
         np.zeros((3, 6)),

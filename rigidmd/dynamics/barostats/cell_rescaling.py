@@ -52,6 +52,7 @@ class CellRescaling(NamedTuple):
 
 
 def barostat(stage: Stage, confinement: Confinement) -> CellRescaling:
+    """The record of stochastic cell rescaling in a stage."""
     return CellRescaling(
         confinement.thermal_energy,
         confinement.pressure,
@@ -65,6 +66,7 @@ def barostat(stage: Stage, confinement: Confinement) -> CellRescaling:
 
 @implements(propose_strain, CellRescaling)
 def propose_rescaling(barostat, model, state, workspace, h, draw):
+    """Set the matrices of a random strain (6,) of the box in a time of h ps. Always a proposal."""
     drift(barostat, model, state, workspace, h, workspace.strain[1], workspace.strain[2])
     for c in range(6):
         xi, _ = normals(barostat.key, draw + c, 0, state.step[NOW])
@@ -114,6 +116,7 @@ def strain_force(barostat, model, state, workspace, k, volume, thermal):
 
 @implements(rescale_velocities, CellRescaling)
 def divide_velocities(barostat, state, workspace):
+    """Transform velocities (n, 3) by the inverse of the strain."""
     inverse = workspace.matrices[1]
     for m in range(len(state.velocity)):
         x, y, z = state.velocity[m, 0], state.velocity[m, 1], state.velocity[m, 2]
@@ -124,6 +127,7 @@ def divide_velocities(barostat, state, workspace):
 
 @implements(log_acceptance, CellRescaling)
 def log_acceptance_of_rescaling(barostat, model, state, workspace, h):
+    """Logarithm of the ratio of probabilities of a move of the box and its reverse."""
     before, after = volume_of(workspace.cell), volume_of(state.cell)
     matrix, inverse = workspace.matrices[0], workspace.matrices[1]
     there = workspace.strain

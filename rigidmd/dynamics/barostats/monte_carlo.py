@@ -49,6 +49,7 @@ class VolumeMoves(NamedTuple):
 
 
 def barostat(stage: Stage, confinement: Confinement) -> VolumeMoves:
+    """The record of Monte Carlo moves of the volume in a stage."""
     thermal_energy = max(confinement.thermal_energy[:2])
     return VolumeMoves(
         confinement.thermal_energy,
@@ -62,6 +63,7 @@ def barostat(stage: Stage, confinement: Confinement) -> VolumeMoves:
 
 @implements(propose_strain, VolumeMoves)
 def propose_volume(barostat, model, state, workspace, h, draw):
+    """Set the matrices of a random change of the volume. Returns False if the move is too large."""
     u, _ = uniforms(barostat.key, draw, 0, state.step[NOW])
     factor = 1 + (2 * u - 1) * barostat.width / volume_of(state.cell)
     # Also for the reverse move: a volume that one move reaches has to be as easy to leave by one.
@@ -76,11 +78,13 @@ def propose_volume(barostat, model, state, workspace, h, draw):
 
 @implements(rescale_velocities, VolumeMoves)
 def keep_velocities(barostat, state, workspace):
+    """Velocities do not change with the volume."""
     return None
 
 
 @implements(log_acceptance, VolumeMoves)
 def log_acceptance_of_volume(barostat, model, state, workspace, h):
+    """Logarithm of the ratio of probabilities of two volumes."""
     before, after = volume_of(workspace.cell), volume_of(state.cell)
     work = target_pressure(barostat.pressure, state, 0) * (after - before)
     work = energy_gained(barostat, model, state, workspace) + work

@@ -48,6 +48,7 @@ class Piston(NamedTuple):
 
 
 def barostat(stage: Stage, confinement: Confinement) -> Piston:
+    """The record of the piston in a stage."""
     moving = 3 * confinement.molecules - sum(confinement.at_rest)
     return Piston(
         confinement.pressure,

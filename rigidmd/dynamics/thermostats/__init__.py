@@ -39,6 +39,7 @@ class Ramp(NamedTuple):
 
 
 def constant_ramp(value: float) -> Ramp:
+    """A set point that stays the same."""
     return Ramp(value, value, 1.0)
 
 

@@ -36,6 +36,7 @@ class Andersen(NamedTuple):
 
 
 def thermostat(stage: Stage, thermal_energy: Ramp, freedom: DegreesOfFreedom, key: Key) -> Andersen:
+    """The record of the Andersen thermostat of a stage."""
     return Andersen(thermal_energy, stage.thermostat_time, key)
 
 

@@ -39,6 +39,7 @@ class Langevin(NamedTuple):
 
 
 def thermostat(stage: Stage, thermal_energy: Ramp, freedom: DegreesOfFreedom, key: Key) -> Langevin:
+    """The record of the Langevin thermostat of a stage."""
     return Langevin(thermal_energy, *stage.thermostat_values.values(), key)
 
 

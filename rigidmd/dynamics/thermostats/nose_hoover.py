@@ -44,6 +44,7 @@ class NoseHoover(NamedTuple):
 def thermostat(
     stage: Stage, thermal_energy: Ramp, freedom: DegreesOfFreedom, key: Key
 ) -> NoseHoover:
+    """The record of the Nosé-Hoover chains of a stage."""
     return NoseHoover(
         thermal_energy,
         stage.thermostat_time,

@@ -39,6 +39,7 @@ class VelocityRescaling(NamedTuple):
 def thermostat(
     stage: Stage, thermal_energy: Ramp, freedom: DegreesOfFreedom, key: Key
 ) -> VelocityRescaling:
+    """The record of velocity rescaling in a stage."""
     return VelocityRescaling(
         thermal_energy, stage.thermostat_time, freedom.translation, freedom.rotation, key
     )

@@ -44,6 +44,7 @@ class HybridMonteCarlo(NamedTuple):
 def thermostat(
     stage: Stage, thermal_energy: Ramp, freedom: DegreesOfFreedom, key: Key
 ) -> HybridMonteCarlo:
+    """The record of the refreshment of momenta in a stage."""
     kept_fraction = 1 - stage.thermostat_values["momentum_refreshment"]
     friction = -log(kept_fraction) / (2 * stage.step) if kept_fraction else inf
     return HybridMonteCarlo(thermal_energy, friction, friction, key)

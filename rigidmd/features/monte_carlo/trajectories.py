@@ -51,6 +51,7 @@ class TrajectoryWorkspace(NamedTuple):
 
 
 def trajectory_workspace(state: State) -> TrajectoryWorkspace:
+    """Arrays for the start of a trajectory from a state."""
     arrays = (array.copy() for array in state[:4])
     known, is_under_way = np.zeros((2, 1), np.int64)
     return TrajectoryWorkspace(

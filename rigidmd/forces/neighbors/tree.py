@@ -37,6 +37,7 @@ def empty_tree(count: int) -> BoxTree:
 
 @task(count_references=False)
 def fit_boxes(arguments, block):
+    """Set the corners (3, boxes) of the box of each cluster, and of each box of boxes above, Å."""
     pairs = load_arguments(arguments)
     tree, clusters = pairs.tree, pairs.clusters
     arity = lanes_of(tree.low)

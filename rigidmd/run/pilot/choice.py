@@ -268,6 +268,7 @@ def _best_for_duration(search: _Search, first: Trial, duration: float) -> tuple[
 
 
 def round_down(step: float) -> float:
+    """A step rounded down to three digits."""
     unit = 10.0 ** (floor(log10(step)) - 2)
     return float(f"{floor(step / unit) * unit:.3g}")
 
