@@ -14,7 +14,7 @@ from rigidmd.features.bodies.assemble import build_body
 from rigidmd.features.bodies.keys.body import SAMPLES, BodyScene
 from rigidmd.features.bodies.motion import Snapshot, motion
 from rigidmd.features.bodies.ode.rates import SMALLEST_SINE
-from rigidmd.features.bodies.system import Pose
+from rigidmd.features.bodies.system import BodySystem, Pose
 from rigidmd.run.pilot.choice import choose
 from rigidmd.run.trial_systems import COMPARATORS
 from rigidmd.run.trials import Method, TrialSystem
@@ -32,43 +32,10 @@ def body_trial_system(
 ) -> tuple[TrialSystem, float]:
     """A body for `span` s (default: its run, up to the first break), and its fastest rate of
     rotation (rad/s)."""
-    run = scene.run
-    keys = (
-        "rotor",
-        "formulation",
-        "relative_tolerance",
-        "absolute_tolerance",
-        "energy_error",
-        "trajectory_error",
-    )
-    plain = dict.fromkeys(keys)
-    fits, refused = {}, {}
-    for name in (*scene.schemes, *COMPARATORS):
-        solver, form = COMPARATORS.get(name, (name, "matrix"))
-        formulation = None if form == "matrix" else form
-        try:
-            changed = run.model_copy(
-                update=plain | {"integrator": solver, "formulation": formulation}
-            )
-            fits[name] = build_body(scene.model_copy(update={"run": changed}), applied)
-        except SceneError as error:
-            # without advice
-            reasons = (
-                re.split(r"[:.] [Uu]se ", text.removeprefix("run: "))[0] for text in error.errors
-            )
-            refused[name] = "; ".join(reasons).replace(solver, "it")
-    if not fits:
-        build_body(scene, applied)  # raises the error
+    fits, refused = _systems_of_methods(scene, applied)
     system = fits["velocity_verlet"]
-    duration = min([span or run.duration_s, *system.breaks()])
-    engine = system.engine()
-    snapshots = [Snapshot(0.0, system.state)]
-    state = engine.begin(system.state, system.method)
-    for step in range(0, COARSE_STEPS, COARSE_STEPS // COARSE_SAMPLES):
-        engine.advance(
-            state, system.method, duration / COARSE_STEPS, step + COARSE_STEPS // COARSE_SAMPLES
-        )
-        snapshots.append(Snapshot(float(state.time[0]), state.copy()))
+    duration = min([span or scene.run.duration_s, *system.breaks()])
+    snapshots = _coarse_motion(system, duration)
     columns = motion(system, snapshots)
     kinetic = float(np.abs(columns["kinetic"]).max()) or 1.0
 
@@ -90,7 +57,7 @@ def body_trial_system(
             scene.schemes[name] if name in scene.schemes else fit.method._replace(duration=duration)
         )
         if not (isinstance(scheme, Solver) or scheme.exact_rotor):
-            scheme = scheme.with_rotor(run.rotor)
+            scheme = scheme.with_rotor(scene.run.rotor)
         methods[name] = Method(lambda _, fit=fit: fit.engine(), scheme)
     at_a_pole = system.rotates and np.hypot(*system.state.rotation[0, :2, 2]) <= SMALLEST_SINE
     reference = max(
@@ -124,6 +91,52 @@ def body_trial_system(
         spin = max(float(np.abs(columns[f"omega_body_{k}"]).max()) for k in (1, 2, 3))
         speed = max(spin, float(np.abs(carried).max() / inertia.max()))
     return trial_system, speed
+
+
+def _systems_of_methods(
+    scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | None
+) -> tuple[dict[str, BodySystem], dict[str, str]]:
+    """The systems of the methods that suit a scene, and why the others do not. Raises SceneError if
+    none does."""
+    plain = dict.fromkeys(
+        (
+            "rotor",
+            "formulation",
+            "relative_tolerance",
+            "absolute_tolerance",
+            "energy_error",
+            "trajectory_error",
+        )
+    )
+    fits, refused = {}, {}
+    for name in (*scene.schemes, *COMPARATORS):
+        solver, form = COMPARATORS.get(name, (name, "matrix"))
+        formulation = None if form == "matrix" else form
+        method = plain | {"integrator": solver, "formulation": formulation}
+        try:
+            changed = scene.run.model_copy(update=method)
+            fits[name] = build_body(scene.model_copy(update={"run": changed}), applied)
+        except SceneError as error:
+            # without advice
+            reasons = (
+                re.split(r"[:.] [Uu]se ", text.removeprefix("run: "))[0] for text in error.errors
+            )
+            refused[name] = "; ".join(reasons).replace(solver, "it")
+    if not fits:
+        build_body(scene, applied)  # raises the error
+    return fits, refused
+
+
+def _coarse_motion(system: BodySystem, duration: float) -> list[Snapshot]:
+    """A run that only measures how fast the body moves."""
+    engine = system.engine()
+    state = engine.begin(system.state, system.method)
+    snapshots = [Snapshot(0.0, system.state)]
+    every = COARSE_STEPS // COARSE_SAMPLES
+    for step in range(every, COARSE_STEPS + every, every):
+        engine.advance(state, system.method, duration / COARSE_STEPS, step)
+        snapshots.append(Snapshot(float(state.time[0]), state.copy()))
+    return snapshots
 
 
 def choose_for_body(

@@ -198,7 +198,7 @@ def choose(
             + "".join(reached[:1])
         )
     best = first
-    per = "ps" if system.time_unit == "fs" else "s"
+    per = system.span_unit
     value = getattr(best, error)
     over = f"over {system.span:.3g} {per}"
     words = ""
