@@ -79,7 +79,7 @@ def plan_averages(
     timesteps : fs. Default: fractions of the longest step that is stable with all methods. For
         them the stages before the last one run
     sample : ps that each is sampled, after a fifth of that
-    progress : called with 0 after all arguments have been checked
+    progress : called with 0 before these stages run
     """
     kind_of(scene).check_has(scene, "averages", option=option("averages"))
     scene = cast(MolecularScene, scene)
@@ -97,8 +97,8 @@ def plan_averages(
     if timesteps and max(timesteps) * FEMTOSECOND > sample:
         error = f"{max(timesteps):g} fs is longer than the {sample:g} ps sampled with it"
         raise SceneError(option("timesteps"), [error])
-    progress(0.0)
     if timesteps is None:
+        progress(0.0)
         timesteps = _default_steps(scene, min(stable_angle(schemes[name]) for name, _ in pairs))
     integrators, thermostats = map(dict.fromkeys, zip(*pairs, strict=True))
     table = f"stages.{len(scene.stages) - 1}"

@@ -57,11 +57,10 @@ if TYPE_CHECKING:
         help=(
             "molecules only: measure the bias of averages instead, by a sweep of the last stage in"
             " runs/NAME-averages under its thermostat (nvt, npt) over integrators and steps, with"
-            " --extrapolate. --integrators"
-            " then accepts names with a thermostat, such as baoab+langevin (default: the method of"
-            " the stage, baoab+velocity_rescaling, baoab+langevin,"
-            " velocity_verlet+velocity_rescaling), and --timesteps has fractions of the longest"
-            " stable step as its default"
+            " --extrapolate. --integrators then accepts names with a thermostat, such as"
+            " baoab+langevin (default: the method of the stage, baoab+velocity_rescaling,"
+            " baoab+langevin, velocity_verlet+velocity_rescaling), and --timesteps has fractions of"
+            " the longest step that is stable with all of them as its default"
         ),
     ),
     argument(
