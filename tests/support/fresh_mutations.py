@@ -297,7 +297,7 @@ FRESH: list[Mutation] = [
         "F33",
         "averages against the step: all pairs of integrators and thermostats run",
         "features/studies/accuracy/averages.py",
-        "        return tuple(found) in self.methods",
+        '        return (integrator, values.get(f"{self.stage}.thermostat", thermostat)) in self.methods',
         "        return True",
         (
             "features/studies/accuracy/test_averages.py::test_methods_and_steps_that_are_averaged_by_default",

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidmd.core.files import unreadable_reason
+from rigidmd.core.toml import Json
 from rigidmd.errors import OutputError
 from rigidmd.features import modules
 from rigidmd.features.analysis.conditions import Condition, check_conditions, trajectory
@@ -255,9 +256,8 @@ class SweepAnalysis(NamedTuple):
     title: str  # of its points
     #: Whether a sweep has it without a request. The argument is its manifest
     is_default: Callable[..., bool]
-    #: Analyses the finished points, and writes files. The arguments are the manifest and the type
-    #: of figures
-    write: Callable[..., tuple[AnalysisResult, list[Path]]]
+    #: The result of the finished points, and the samples used. The argument is the manifest
+    measure: Callable[..., tuple[AnalysisResult, Json]]
 
 
 def sweep_analyses() -> list[SweepAnalysis]:

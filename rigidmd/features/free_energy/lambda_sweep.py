@@ -7,7 +7,6 @@ import numpy as np
 from rigidmd.core.toml import Json
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError
-from rigidmd.features.analysis.files import write_results
 from rigidmd.features.analysis.registry import SweepAnalysis
 from rigidmd.features.analysis.result import AnalysisResult
 from rigidmd.features.free_energy.coupling import energy_to_lambda
@@ -55,12 +54,6 @@ def free_energy(sweep: Table | str | Path) -> AnalysisResult:
     OutputError
     """
     return _free_energy(manifest_of(sweep))[0]
-
-
-def write_free_energy(manifest: Manifest, figures: str) -> tuple[AnalysisResult, list[Path]]:
-    """The free energy of the finished points, and its files. Raises OutputError."""
-    result, used = _free_energy(manifest)
-    return result, write_results(manifest.folder, used, [result], {}, figures)
 
 
 def _free_energy(manifest: Manifest) -> tuple[AnalysisResult, Json]:
@@ -131,4 +124,4 @@ def _standard_state(system: System, volume: float) -> str:
     )
 
 
-SWEEP_ANALYSIS = SweepAnalysis(NAME, ABOUT, OVER, "all points", is_of_coupling, write_free_energy)
+SWEEP_ANALYSIS = SweepAnalysis(NAME, ABOUT, OVER, "all points", is_of_coupling, _free_energy)

@@ -10,7 +10,6 @@ from rigidmd.core.quantities import restrained_distance
 from rigidmd.core.toml import Json
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError
-from rigidmd.features.analysis.files import write_results
 from rigidmd.features.analysis.registry import SweepAnalysis
 from rigidmd.features.analysis.result import AnalysisResult
 from rigidmd.features.analysis.rigid_frames import production_samples
@@ -58,12 +57,6 @@ def pmf(sweep: Table | str | Path) -> AnalysisResult:
 def manifest_of(sweep: Table | str | Path) -> Manifest:
     """The manifest of a sweep or of its folder. Raises OutputError."""
     return read_manifest(sweep.folder if isinstance(sweep, Table) else Path(sweep))
-
-
-def write_mean_force(manifest: Manifest, figures: str) -> tuple[AnalysisResult, list[Path]]:
-    """The potential of mean force of the finished points, and its files. Raises OutputError."""
-    result, used = _mean_force(manifest)
-    return result, write_results(manifest.folder, used, [result], {}, figures)
 
 
 def _mean_force(manifest: Manifest) -> tuple[AnalysisResult, Json]:
@@ -141,4 +134,4 @@ def _window(folder: Path, k: int) -> tuple[Window, float, Json]:
     return window, float(stage.temperatures[1]), used_samples(record, stage, production)
 
 
-SWEEP_ANALYSIS = SweepAnalysis(NAME, ABOUT, OVER, "all windows", is_of_windows, write_mean_force)
+SWEEP_ANALYSIS = SweepAnalysis(NAME, ABOUT, OVER, "all windows", is_of_windows, _mean_force)

@@ -9,12 +9,7 @@ from rigidmd.assemble.harmonic import stable_angle
 from rigidmd.core.integrators import WITH_THERMOSTAT
 from rigidmd.core.toml import Json
 from rigidmd.errors import SceneError, option
-from rigidmd.features.studies.accuracy.start import (
-    check_engine_is_rigidmd,
-    check_number_of_steps,
-    check_times,
-    start_of_last_stage,
-)
+from rigidmd.features.studies.accuracy.start import check_engine_is_rigidmd, start_of_last_stage
 from rigidmd.features.studies.sweep.plan import Axis
 from rigidmd.run.kind import kind_of
 from rigidmd.run.stable_step import stiffest_mode
@@ -57,10 +52,9 @@ class AveragesPlan(NamedTuple):
         return f"{self.stage}.timestep_fs"
 
     def includes(self, values: Json) -> bool:
-        first = self.methods[0]
-        names = (f"{self.stage}.integrator", f"{self.stage}.thermostat")
-        found = [values.get(name, same) for name, same in zip(names, first, strict=True)]
-        return tuple(found) in self.methods
+        integrator, thermostat = self.methods[0]
+        integrator = values.get(f"{self.stage}.integrator", integrator)
+        return (integrator, values.get(f"{self.stage}.thermostat", thermostat)) in self.methods
 
 
 def plan_averages(
@@ -71,7 +65,8 @@ def plan_averages(
     sample: float = SAMPLE_PS,
     progress: Callable[[float], object] = lambda fraction: None,
 ) -> AveragesPlan:
-    """The sweep of the last stage of a scene by methods at time steps. Raises SceneError.
+    """The sweep of the last stage of a scene by methods at time steps, whose scenes are not yet
+    checked. Raises SceneError.
 
     overrides : keys that were set of the file of the scene
     methods : "integrator" or "integrator+thermostat". Default: the method of the stage and
@@ -90,13 +85,6 @@ def plan_averages(
     if not methods and not stage.is_auto:
         pairs.insert(0, (stage.integrator, stage.thermostat_kind))
     pairs = list(dict.fromkeys(pairs))
-    names = f"time steps and {option('sample_ps')}"
-    check_times(scene, (sample, *(timesteps or [])), names)
-    for step in timesteps or []:
-        check_number_of_steps(sample, step * FEMTOSECOND)
-    if timesteps and max(timesteps) * FEMTOSECOND > sample:
-        error = f"{max(timesteps):g} fs is longer than the {sample:g} ps sampled with it"
-        raise SceneError(option("timesteps"), [error])
     if timesteps is None:
         progress(0.0)
         timesteps = _default_steps(scene, min(stable_angle(schemes[name]) for name, _ in pairs))

@@ -8,7 +8,12 @@ from typing import NamedTuple
 
 from rigidmd.core.files import writing
 from rigidmd.errors import OutputError, RigidMDError
-from rigidmd.features.analysis.files import FIGURES, AnalysisOutput, analyse_frames
+from rigidmd.features.analysis.files import (
+    FIGURES,
+    AnalysisOutput,
+    analyse_frames,
+    write_results,
+)
 from rigidmd.features.analysis.options import check_options
 from rigidmd.features.analysis.registry import selected, sweep_analyses
 from rigidmd.features.analysis.result import AnalysisResult
@@ -80,7 +85,8 @@ def analyse_sweep(
         if name not in names and (names or not analysis.is_default(manifest)):
             continue
         try:
-            result, files = analysis.write(manifest, figures)
+            result, used = analysis.measure(manifest)
+            files = write_results(folder, used, [result], {}, figures)
             combinations.append(Combination(title, len(finished), [result], {}, files))
         except OutputError as error:
             if name in names:
