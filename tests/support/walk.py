@@ -195,7 +195,7 @@ def commands_of(scene: Path) -> Iterator[tuple[str, list[str]]]:
     measured = ["accuracy", text, "--repeats", "1", "--integrators"]
     trial = ["velocity_verlet", "--timesteps", steps, "--span", span]
     yield "accuracy", [*measured, *trial, "-o", f"{stem}_accuracy"]
-    sample = ["baoab+langevin", "--averages", "--sample-ps", "0.05"]
+    sample = ["baoab+langevin", "--averages", "--sample-ps", "0.05", "--timesteps", steps]
     yield "accuracy --averages", [*measured, *sample, "-o", f"{stem}_averages"]
 
 

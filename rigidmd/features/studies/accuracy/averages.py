@@ -9,7 +9,11 @@ from rigidmd.assemble.harmonic import stable_angle
 from rigidmd.core.integrators import WITH_THERMOSTAT
 from rigidmd.core.toml import Json
 from rigidmd.errors import SceneError, option
-from rigidmd.features.studies.accuracy.start import check_engine_is_rigidmd, start_of_last_stage
+from rigidmd.features.studies.accuracy.start import (
+    check_engine_is_rigidmd,
+    check_times,
+    start_of_last_stage,
+)
 from rigidmd.features.studies.sweep.plan import Axis
 from rigidmd.run.kind import kind_of
 from rigidmd.run.stable_step import stiffest_mode
@@ -85,6 +89,7 @@ def plan_averages(
     if not methods and not stage.is_auto:
         pairs.insert(0, (stage.integrator, stage.thermostat_kind))
     pairs = list(dict.fromkeys(pairs))
+    check_times(scene, (sample, *(timesteps or [])), f"time steps and {option('sample_ps')}")
     if timesteps is None:
         progress(0.0)
         timesteps = _default_steps(scene, min(stable_angle(schemes[name]) for name, _ in pairs))
