@@ -110,16 +110,18 @@ def _drawn_columns(table: Table) -> list[str]:
     return [column for column in columns if column not in omitted][:MOST_PANELS]
 
 
-def _panels(titles: Sequence[str]) -> "tuple[Picture, list[Axes]]":
-    """A figure, and its panels with these titles."""
-    figure, axes = panel_grid(len(titles), 2 if len(titles) <= MOST_PANELS else 3, 4.4, 3.0, 0.4)
-    for axis, title in zip(axes, titles, strict=True):
+def panels(columns: Sequence[str]) -> "tuple[Picture, list[Axes]]":
+    """A figure with a panel for each column."""
+    titles = main_titles()
+    figure, axes = panel_grid(len(columns), 2 if len(columns) <= MOST_PANELS else 3, 4.4, 3.0, 0.4)
+    for axis, column in zip(axes, columns, strict=True):
+        title = titles.get(column, column).replace("kJ/mole", "kJ/mol")
         axis.set_title(title, loc="left", fontsize=9, color=INK)
         open_axis(axis, labelsize=8)
     return figure, axes
 
 
-def _add_legend(figure: "Picture", axis: "Axes") -> None:
+def add_legend(figure: "Picture", axis: "Axes") -> None:
     """Name the curves of one panel, which all have, if there are several and not too many."""
     handles, labels = axis.get_legend_handles_labels()
     if 1 < len(labels) <= MOST_NAMED:
@@ -138,19 +140,16 @@ def _is_number(value: object) -> bool:
     return type(value) in (int, float)
 
 
-def draw_table(table: Table, columns: list[str], *, connected: bool = True) -> "Picture":
+def draw_table(table: Table, columns: list[str]) -> "Picture":
     """A panel for each column against the first key with numbers, else the first key. Without keys
     against the seed."""
     rows = [row for row in table.rows if row.runs]
     numbers = [key for key in table.keys if all(_is_number(row.values[key]) for row in rows)]
     key = [*numbers, *table.keys, SEED][0]
-    of_main = main_titles()
-    titles = [of_main.get(column, column).replace("kJ/mole", "kJ/mol") for column in columns]
-    figure, axes = _panels(titles)
+    figure, axes = panels(columns)
     if key == SEED:
         for axis, column in zip(axes, columns, strict=True):
             _draw_band(axis, *rows[0][column])
-        connected = False
         rows = [SweepRow({SEED: seed}, {seed: run}) for seed, run in rows[0].runs.items()]
         numbers = [SEED]
     if numbers:
@@ -162,13 +161,13 @@ def draw_table(table: Table, columns: list[str], *, connected: bool = True) -> "
         curves.setdefault(label, []).append(row)
     values = [row.values[key] for row in rows]
     for axis, column in zip(axes, columns, strict=True):
-        _draw(axis, curves, key, column, connected=connected)
+        _draw(axis, curves, key, column)
         axis.set_xlabel(axis_label(key, table.together.get(key, ())), fontsize=9, color=INK)
         if numbers and all(float(value).is_integer() for value in values):
             axis.locator_params(axis="x", integer=True)
         elif not numbers and max(len(value_name(value)) for value in values) > LONG_WORD:
             axis.tick_params(axis="x", rotation=20)
-    _add_legend(figure, axes[0])
+    add_legend(figure, axes[0])
     return figure
 
 
@@ -179,9 +178,7 @@ def _draw_band(axis: "Axes", mean: float, error: float | None) -> None:
     axis.axhspan(mean - error, mean + error, color=FAINT, alpha=0.25, lw=0, zorder=0)
 
 
-def _draw(
-    axis: "Axes", curves: dict[str, list[SweepRow]], key: str, column: str, *, connected: bool
-) -> None:
+def _draw(axis: "Axes", curves: dict[str, list[SweepRow]], key: str, column: str) -> None:
     """Draw a column against a key, a curve for each label."""
     from matplotlib.transforms import ScaledTranslation  # slow to import
 
@@ -202,7 +199,7 @@ def _draw(
             ms=3.5,
             capsize=2.5,
             elinewidth=0.9,
-            **curve_style(k, connected=connected),
+            **curve_style(k, connected=key != SEED),
         )
         if np.isfinite(errors).any():
             for artist in curve.get_children():

@@ -27,23 +27,27 @@ from rigidmd.features.studies.joint_fit import (
     fit_jointly,
     results_of_run,
 )
-from rigidmd.features.studies.sweep.figure import draw_table
-from rigidmd.features.studies.sweep.folder import Manifest, describe_values, point_name, short_keys
+from rigidmd.features.studies.sweep.figure import add_legend, panels
+from rigidmd.features.studies.sweep.folder import (
+    Manifest,
+    describe_values,
+    point_name,
+    readable_key,
+    short_keys,
+)
 from rigidmd.features.studies.sweep.table import (
     DENSITY,
     DRIFT,
     POTENTIAL,
     PRESSURE,
     Measured,
-    SweepRow,
-    Table,
     key_cells,
     main_titles,
     measured_values,
     report_of,
     summarise_run,
 )
-from rigidmd.features.view.figures.style import curve_style, write_figure
+from rigidmd.features.view.figures.style import INK, curve_style, write_figure
 from rigidmd.features.view.page import code, items, plain, section, table, wide, write_page
 from rigidmd.io.folder import add_to_folder
 from rigidmd.io.write import Cell, ReportTable, nine_digits
@@ -398,37 +402,25 @@ def _figure(limits: Limits):
         return main.index(name) if name in main else len(main) + (name in of_log)
 
     independent = [limit for limit in limits.limits if limit.kind == INDEPENDENT]
-    quantities = dict.fromkeys(limit.quantity for limit in independent)
-    shown = sorted(quantities, key=rank)[:MOST_PANELS]
-    rows: dict[tuple[str, float], SweepRow] = {}
-    for limit in independent:
-        for point in limit.points:
-            row = SweepRow({limits.key: point.timestep} | limit.values, {None: {}})
-            row = rows.setdefault((limit.label, point.timestep), row)
-            row.runs[None][limit.quantity] = point.mean, point.error
-    means = Table(Path(), [limits.key, *limits.keys], list(rows.values()), shown)
-    figure = draw_table(means, shown, connected=False)
+    shown = sorted({limit.quantity: None for limit in independent}, key=rank)[:MOST_PANELS]
     labels = list(dict.fromkeys(limit.label for limit in independent))
+    figure, axes = panels(shown)
     for limit in independent:
         if limit.quantity in shown:
-            axis = figure.axes[shown.index(limit.quantity)]
-            _draw_limit(axis, limit, labels.index(limit.label))
+            _draw_limit(axes[shown.index(limit.quantity)], limit, labels.index(limit.label))
+    for axis in axes:
+        axis.set_xlabel(readable_key(limits.key), fontsize=9, color=INK)
+    add_legend(figure, axes[0])
     return figure
 
 
 def _draw_limit(axis: "Axes", limit: Limit, k: int) -> None:
     fit = limit.fit
     style = curve_style(k, connected=False)
-    axis.errorbar(
-        [0],
-        [fit.limit],
-        [fit.limit_error],
-        ms=4,
-        capsize=2.5,
-        mfc="none",
-        clip_on=False,
-        **style,
-    )
+    _, steps, means, errors, _ = zip(*limit.points, strict=True)
+    axis.errorbar(steps, means, errors, label=limit.label, ms=3.5, capsize=2.5, **style)
+    at_zero = [0], [fit.limit], [fit.limit_error]
+    axis.errorbar(*at_zero, ms=4, capsize=2.5, mfc="none", clip_on=False, **style)
     step = np.linspace(0, fit.longest, 60)
     slope, _ = fit.slopes.get(limit.method, (0.0, 0.0))
     axis.plot(step, fit.limit + slope * step**limit.order, color=style["color"], lw=0.9)
