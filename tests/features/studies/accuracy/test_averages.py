@@ -81,8 +81,8 @@ def test_averages_of_oscillators_are_off_by_what_theory_states():
                     means.append(MeanAtStep(integrator, step, mean, error))
     fit = extrapolate([point for point in means if point.timestep < 0.9 * unit])
     assert abs(fit.limit - thermal) < 4 * fit.limit_error
-    # 1 % of kT is x/8
-    step = np.sqrt(0.01 * thermal / 1.5 / fit.slopes["velocity_verlet"][0])
+    # 1 % of kT per degree of freedom is x/8
+    step = np.sqrt(0.02 * thermal / fit.slopes["velocity_verlet"][0])
     assert step == pytest.approx(unit * np.sqrt(0.08), rel=0.15)
     assert abs(fit.slopes["baoab"][0]) < 4 * fit.slopes["baoab"][1]
 
