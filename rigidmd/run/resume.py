@@ -210,17 +210,13 @@ def state_from(arrays: Mapping[str, np.ndarray], like: State, *, exact: bool = T
 
     exact : whether the method of the run keeps rotation matrices orthogonal to rounding
     """
-    state = State(*(np.array(arrays[name], order="C") for name in State._fields))
-    shapes = {name: expected.shape for name, expected in zip(State._fields, like, strict=True)}
+    expected = like._asdict()
+    state = State(*(np.array(arrays[name], array.dtype) for name, array in expected.items()))
+    shapes = {name: array.shape for name, array in expected.items()}
     for name, problem in array_errors(
         dict(zip(State._fields, state, strict=True)), shapes, exact=exact
     ).items():
         raise ValueError(f"{name} of its state {problem}")
-    for name, array, expected in zip(State._fields, state, like, strict=True):
-        if array.dtype != expected.dtype:
-            raise ValueError(
-                f"{name} of its state is of the type {array.dtype}, not {expected.dtype}"
-            )
     if (np.isfinite(state.cell) != np.isfinite(like.cell)).any():
         raise ValueError("its state has another kind of box")
     return state
