@@ -13,7 +13,6 @@ from .features.potentials.user_code.force import Force as Force
 from .features.potentials.user_code.kernels import compiled_force as compiled_force
 from .features.potentials.user_code.kernels import compiled_thermostat as compiled_thermostat
 from .features.potentials.user_code.pair_potential import PairPotential as PairPotential
-from .features.potentials.user_code.pair_potential import pair_law as pair_law
 from .features.potentials.user_code.pair_potential import pair_potential as pair_potential
 from .features.potentials.user_code.trust import trust as trust
 from .features.studies.normal_modes import normal_modes as normal_modes

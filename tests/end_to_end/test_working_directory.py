@@ -19,7 +19,7 @@ from rigidmd.core.process import python_process
 #: Packages that rigidmd, or what it needs, imports.
 PACKAGES = (
     "MDAnalysis ase dask distributed filelock gemmi gsd lazy_loader llvmlite matplotlib numba numpy pandas platformdirs pydantic "
-    "pymbar rigidmd rocket_fft scipy sympy tomli_w tqdm yaml"
+    "pymbar rigidmd rocket_fft scipy tomli_w tqdm yaml"
 )
 
 

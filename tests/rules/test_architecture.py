@@ -64,7 +64,6 @@ LIBRARIES = {
     "openmm": {"features/external/openmm"},
     "pydantic": {"scene", "io", "run", "features"},
     "rocket_fft": {"forces/ewald/pme.py"},
-    "sympy": {"features/potentials/sites/text_formulas.py", "features/external/force_field.py"},
     "tomli_w": {"io/scene_file.py"},
 }
 

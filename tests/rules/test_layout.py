@@ -64,7 +64,8 @@ TESTED_BY = {
     "features/potentials/test_python_forces.py": "features/potentials/user_code/force features/potentials/user_code/force_checks",
     "features/potentials/test_shipped.py": "features/potentials/poses/shapes features/potentials/poses/bodies features/potentials/poses/formulas features/potentials/poses/gay_berne"
     " features/potentials/poses/multipoles features/potentials/poses/patch features/potentials/poses/potential",
-    "features/potentials/test_slopes.py": "features/potentials/poses/trace",
+    "features/potentials/test_slopes.py": "features/potentials/expressions/trace",
+    "features/potentials/test_text.py": "features/potentials/expressions/radial",
     "features/potentials/test_torques.py": "features/potentials/user_code/pose_checks",
     "features/potentials/test_user_code.py": "features/potentials/user_code/binding"
     " features/potentials/user_code/compiled features/potentials/user_code/trust core/user_modules"

@@ -214,8 +214,6 @@ REFUSED_NAMES = set(
         "waves",
     ]
 )
-#: Names that stay: keys of scenes, names of other libraries and former public names.
-ALLOWED_NAMES = {"pair_law"}
 
 
 def names_in(path):
@@ -234,7 +232,7 @@ def refused_names_in(path):
     """(line and name, refused parts) of the names that a file defines."""
     for line, name in names_in(path):
         parts = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower().split("_")
-        if name not in ALLOWED_NAMES and (bad := sorted(REFUSED_NAMES & set(parts))):
+        if bad := sorted(REFUSED_NAMES & set(parts)):
             yield f"{line}: the name {name!r}", bad
 
 

@@ -57,7 +57,7 @@ def named(values: dict) -> SimpleNamespace:
 
 def evaluated(formula):
     """A formula as a function of a row of numbers and two poses, in plain Python."""
-    function = sys.modules[formula.kind.__module__]._of_poses
+    function = sys.modules[formula.kind.__module__]._of_formula
     return partial(getattr(function, "py_func", function), formula.kind())
 
 

@@ -279,7 +279,7 @@ TIERS = {
         "features/potentials/test_tables.py": (
             "a_table_in_a_file_is_the_potential_that_it_lists*",
         ),
-        "features/potentials/test_text_formulas.py": ("any_text_is_read_or_refused_soon",),
+        "features/potentials/test_text.py": ("any_text_is_read_or_refused_soon",),
         "features/potentials/test_user_code.py": (
             "every_example_of_an_extension_runs_and_is_short*",
         ),

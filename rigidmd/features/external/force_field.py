@@ -9,11 +9,14 @@ truncation are decided once. `unknown_terms` lists what no other program can exp
 from collections.abc import Callable, Iterator, Mapping
 from itertools import combinations_with_replacement, pairwise, product
 from math import inf
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from rigidmd.engines.system import System
+from rigidmd.features.potentials.expressions.radial import Radial
+from rigidmd.features.potentials.expressions.slopes import function_of, slopes_of
+from rigidmd.features.potentials.expressions.trace import Graph, Traced
 from rigidmd.features.potentials.extra import body_pairs_of
 from rigidmd.forces.ewald.corrections import Background, SurfaceDipole
 from rigidmd.forces.ewald.direct_sum import EwaldSum
@@ -33,9 +36,6 @@ from rigidmd.forces.potentials.truncation import (
 from rigidmd.forces.terms import trait
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.validation import not_none
-
-if TYPE_CHECKING:
-    import sympy
 
 #: Classes of the pair potentials and terms that the view describes.
 DESCRIBED = (
@@ -263,32 +263,25 @@ def _truncated(formula: str, truncation: Truncation, end: tuple[float, ...]) -> 
 def table(formula: str, first: float, last: float, entries: int) -> str:
     """A table for LAMMPS' pair style `table`, even in r² from `first` to `last` Å: number, r,
     energy, force."""
-    import sympy  # slow to import
-
-    r, energy = _symbolic(formula)
+    r = Graph().leaf("r")
+    energy = _traced(formula, r)
     x = np.sqrt(np.linspace(first**2, last**2, entries))
-    with np.errstate(all="ignore"):
-        columns = [
-            sympy.lambdify(r, y, ["numpy", "scipy"])(x) for y in (energy, -sympy.diff(energy, r))
-        ]
-    rows = zip(x, *(np.broadcast_to(column, x.shape) for column in columns), strict=True)
+    columns = function_of([energy, -slopes_of(energy, [r])[0]], "r", np)(x)
+    rows = zip(*np.broadcast_arrays(x, *columns), strict=True)
     head = f"N {entries} RSQ {first:.17g} {last:.17g}\n\n"
     return head + "".join(
         f"{k} {x:.15g} {u:.15g} {f:.15g}\n" for k, (x, u, f) in enumerate(rows, 1)
     )
 
 
-def _symbolic(formula: str) -> "tuple[sympy.Symbol, sympy.Expr]":
-    """The symbol r, and the expression of a formula."""
-    import sympy  # slow to import
-
-    r = sympy.Symbol("r", positive=True)
+def _traced(formula: str, r: Traced) -> Traced:
+    """A formula as a function of r."""
     text, *definitions = (part.strip() for part in formula.replace("^", "**").split(";"))
-    names: dict[str, object] = {"r": r, "max": sympy.Max}
+    names = {"r": r, "max": np.maximum, "erfc": Traced.erfc}
     for definition in reversed(definitions):
         name, _, value = definition.partition("=")
-        names[name] = sympy.parse_expr(value, names)
-    return r, sympy.parse_expr(text, names)
+        names[name] = eval(value, names)
+    return eval(text, names)
 
 
 def tail_of_formulas(view: ForceFieldView, volume: float) -> float:
@@ -317,24 +310,23 @@ def _removed_by_truncation(
     view: ForceFieldView, sigma: float, epsilon: float
 ) -> tuple[float, Callable[[float], float]]:
     """The integral of r² (v - truncated v) over all r, and v - truncated v as a function of r."""
-    import sympy  # slow to import
-    from scipy.integrate import quad
+    from scipy.integrate import quad  # slow to import
 
     potential = not_none(view.lennard_jones)
     powers = 4 * epsilon * sigma**12, 4 * epsilon * sigma**6
     nothing = (0.0,) * 4
     unmodified = potential._replace(truncation=Unmodified(inf), terms12=nothing, terms6=nothing)
-    r, energy = _symbolic(lennard_jones_formula(unmodified, *powers, 1.0))
-    # expanded, so that 1/r¹² cancels where it is not truncated
-    inside = sympy.lambdify(
-        r, sympy.expand(energy - _symbolic(lennard_jones_formula(potential, *powers, 1.0))[1])
-    )
-    beyond = sympy.lambdify(r, energy)
+    r = Graph().leaf("r")
+    energy = _traced(lennard_jones_formula(unmodified, *powers, 1.0), r)
+    inside = energy - _traced(lennard_jones_formula(potential, *powers, 1.0), r)
+    # added up, so that 1/r¹² cancels where it is not truncated
+    inside = function_of([Radial(r).sum_of_products(inside)], "r", np)
+    beyond = function_of([energy], "r", np)
 
     def removed(distance: float) -> float:
-        return float(
-            inside(max(distance, CONTACT)) if distance <= potential.cutoff else beyond(distance)
-        )
+        if distance > potential.cutoff:
+            return beyond(distance)[0]
+        return float(inside(max(distance, CONTACT))[0])
 
     start = (
         potential.cutoff
@@ -343,7 +335,7 @@ def _removed_by_truncation(
     )
     ends = sorted({0.0, float(start), float(potential.cutoff)})
     parts = [quad(lambda x: x**2 * removed(x), a, b)[0] for a, b in pairwise(ends)]
-    return sum(parts) + quad(lambda x: x**2 * beyond(x), potential.cutoff, inf)[0], removed
+    return sum(parts) + quad(lambda x: x**2 * beyond(x)[0], potential.cutoff, inf)[0], removed
 
 
 def _distances_in_molecules(view: ForceFieldView, i: int, j: int) -> Iterator[tuple[float, int]]:

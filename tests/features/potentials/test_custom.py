@@ -14,8 +14,11 @@ import rigidmd
 from rigidmd.assemble.build import build
 from rigidmd.errors import SceneError
 from rigidmd.features.potentials.sites.custom import CustomOneKind, tail_of_pair
-from rigidmd.features.potentials.sites.formulas import FormulaError, formula_of_function
-from rigidmd.features.potentials.sites.text_formulas import formula_of_text
+from rigidmd.features.potentials.sites.formulas import (
+    FormulaError,
+    formula_of_function,
+    formula_of_text,
+)
 from rigidmd.forces.potentials.lennard_jones import energy_and_force as of_built_in
 from rigidmd.forces.potentials.lennard_jones import lennard_jones as built_in
 from rigidmd.forces.potentials.lennard_jones import tail

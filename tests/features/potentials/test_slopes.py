@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from rigidmd.features.potentials.expressions.slopes import code_of, function_of, slopes_of
+from rigidmd.features.potentials.expressions.trace import Graph, TraceError
 from rigidmd.features.potentials.poses.formulas import formula_of_poses
-from rigidmd.features.potentials.poses.slopes import code_of, slopes_of
-from rigidmd.features.potentials.poses.trace import Graph, TraceError
 
 
 def traced(function, names):
@@ -13,11 +13,8 @@ def traced(function, names):
     graph = Graph()
     leaves = [graph.leaf(name) for name in names]
     output = function(*leaves)
-    lines, texts = code_of([output, *slopes_of(output, leaves)])
-    source = "\n    ".join([f"def f({', '.join(names)}):", *lines, f"return {', '.join(texts)}"])
-    space: dict = {}
-    exec(f"from math import *\n{source}", space)
-    return space["f"], len(lines)
+    outputs = [output, *slopes_of(output, leaves)]
+    return function_of(outputs, ", ".join(names), np), len(code_of(outputs)[0])
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,11 @@ from support.stops import same_after_stops
 import rigidmd
 from rigidmd.assemble.build import build
 from rigidmd.errors import SceneError
-from rigidmd.features.potentials.sites.formulas import FormulaError, formula_of_table
-from rigidmd.features.potentials.sites.text_formulas import formula_of_text
+from rigidmd.features.potentials.sites.formulas import (
+    FormulaError,
+    formula_of_table,
+    formula_of_text,
+)
 from rigidmd.run.kind import describe
 from rigidmd.units import KJ_PER_MOL
 

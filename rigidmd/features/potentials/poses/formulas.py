@@ -8,11 +8,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.core.user_modules import module_of
 from rigidmd.errors import describe_error
-from rigidmd.features.potentials.poses.slopes import Hoisted, code_of, slopes_of, values_of
+from rigidmd.features.potentials.expressions.slopes import (
+    Hoisted,
+    code_of,
+    formula_module,
+    function_of,
+    slopes_of,
+)
+from rigidmd.features.potentials.expressions.trace import Graph, Number, Traced, TraceError
+from rigidmd.features.potentials.poses.pairs import pair_slopes
 from rigidmd.features.potentials.poses.table import BodyTable, TableFormula
-from rigidmd.features.potentials.poses.trace import Graph, Number, Traced, TraceError
 from rigidmd.units import KJ_PER_MOL
 
 AXES = "xyz"
@@ -81,8 +87,13 @@ def formula_of_poses(
         outputs = _derived(name, returned, r, matrices)
     names = [f"{body}.{key}" for body in ("p", "q") for key in parameters]
     hoisted = Hoisted(outputs, names)
-    lines, texts = code_of(outputs, {index: f"p[{k}]" for index, k in hoisted.places.items()})
-    module = module_of(_source(name, lines, texts).encode(), f"<potential {name}>")
+    places = {index: f"p[{k}]" for index, k in hoisted.places.items()}
+    lines, texts = code_of(outputs, places)
+    values_at = function_of(outputs, "x, y, z, a, b, p", np, places)
+    operations = len(lines)
+    lines, (e, gx, gy, gz, tx, ty, tz, ux, uy, uz) = _with_entries(lines, texts)
+    vectors = f"({gx}, {gy}, {gz}), ({tx}, {ty}, {tz}), ({ux}, {uy}, {uz})"
+    module = formula_module(name, pair_slopes, "formula, p, r, a, b", lines, f"{e}, {vectors}")
 
     def numbers(first: Mapping[str, float], second: Mapping[str, float]) -> list[float]:
         values = {f"p.{key}": first[key] for key in parameters}
@@ -90,15 +101,12 @@ def formula_of_poses(
         return hoisted.values(values)
 
     def pair_values(row: np.ndarray, r: np.ndarray, a: np.ndarray, b: np.ndarray) -> PairValues:
-        leaves = dict(zip(AXES, r.T, strict=True))
-        for body, matrix in (("a", a), ("b", b)):
-            leaves |= {f"{body}[{i}, {j}]": matrix[:, i, j] for i in range(3) for j in range(3)}
-        known = {index: row[k] for index, k in hoisted.places.items()}
-        energy, *vectors = values_of(outputs, leaves, known)
+        matrices = (np.moveaxis(matrix, 0, -1) for matrix in (a, b))
+        energy, *vectors = np.broadcast_arrays(*values_at(*r.T, *matrices, row))
         return PairValues(energy, *np.transpose(np.reshape(vectors, (3, 3, -1)), (0, 2, 1)))
 
     is_derived = not isinstance(returned, tuple)
-    return PoseFormula(module.Formula, numbers, pair_values, len(lines), is_derived)
+    return PoseFormula(module.Formula, numbers, pair_values, operations, is_derived)
 
 
 class _Parameters:
@@ -171,30 +179,12 @@ def _given(name: str, returned: tuple) -> list[Number]:
     return [value * KJ_PER_MOL for value in values]
 
 
-def _source(name: str, lines: list[str], texts: list[str]) -> str:
+def _with_entries(lines: list[str], texts: list[str]) -> tuple[list[str], list[str]]:
+    """Lines and texts with the entries of both matrices as names, and first the lines of these."""
     used = set(re.findall(r"[ab]\[\d, \d\]", "\n".join([*lines, *texts])))
     entries = [f"{entry[0]}{entry[2]}{entry[5]} = {entry}" for entry in sorted(used)]
 
     def short(text: str) -> str:
         return re.sub(r"([ab])\[(\d), (\d)\]", r"\1\2\3", text)
 
-    body = "\n".join(f"    {line}" for line in ["x, y, z = r", *entries, *map(short, lines)])
-    e, gx, gy, gz, tx, ty, tz, ux, uy, uz = map(short, texts)
-    return f"""\
-# {name}, written by rigidmd
-from math import acos, cos, exp, fabs, log, pow, sin, sqrt, tanh
-from typing import NamedTuple
-
-from rigidmd.compile import implements
-from rigidmd.features.potentials.poses.pairs import pair_slopes
-
-
-class Formula(NamedTuple):
-    nothing: float = 0.0
-
-
-@implements(pair_slopes, Formula)
-def _of_poses(formula, p, r, a, b):
-{body}
-    return {e}, ({gx}, {gy}, {gz}), ({tx}, {ty}, {tz}), ({ux}, {uy}, {uz})
-"""
+    return ["x, y, z = r", *entries, *map(short, lines)], [*map(short, texts)]

@@ -1,14 +1,16 @@
 """The shipped pair potentials of bodies, and pair potentials from an expression, for scenes."""
 
 from collections.abc import Callable, Mapping
+from math import pi
 from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.core.plain_text import did_you_mean
+from rigidmd.features.potentials.expressions.text import names_in, parse_energy, value_of
+from rigidmd.features.potentials.expressions.trace import Graph, Number
 from rigidmd.features.potentials.poses import gay_berne, multipoles, patch
 from rigidmd.features.potentials.poses.gay_berne import GayBerne
-from rigidmd.features.potentials.poses.trace import Number
 
 
 class Shipped(NamedTuple):
@@ -76,25 +78,21 @@ ANGLES = ("a_r", "b_r", "a_b")
 def function_of_text(energy: str, mixing: Mapping[str, str]) -> Callable:
     """The function of a text such as "4*eps*((sig/r)**12 - (sig/r)**6)*(1 + k*a_r*b_r)". Raises
     FormulaError."""
-    from rigidmd.features.potentials.sites import text_formulas  # SymPy is slow to import
-
-    parsed = text_formulas.parse_energy(energy)
-    prefix = text_formulas.PARAMETER_PREFIX
-    names = sorted(
-        symbol.name.removeprefix(prefix)
-        for symbol in parsed.free_symbols
-        if symbol.name.startswith(prefix) and symbol.name.removeprefix(prefix) not in ANGLES
-    )
+    tree = parse_energy(energy)
+    names = names_in(tree)
+    graph = Graph()
+    value_of(tree, {"pi": pi, **{name: graph.leaf(name) for name in names}})  # for its errors
 
     def function(r: np.ndarray, u: np.ndarray, v: np.ndarray, p: object, q: object) -> Number:
         distance = np.sqrt(r @ r)
-        values: dict[str, Number] = {DISTANCE: distance}
         angles = ((u @ r) / distance, (v @ r) / distance, u @ v)
-        values |= {prefix + name: angle for name, angle in zip(ANGLES, angles, strict=True)}
+        values = {"pi": pi, DISTANCE: distance, **dict(zip(ANGLES, angles, strict=True))}
         for name in names:
-            mean = MEANS[mixing.get(name, "arithmetic" if name[:3] == "sig" else "geometric")]
-            values[prefix + name] = mean(getattr(p, name), getattr(q, name))
-        return text_formulas.value_of(parsed, values)
+            if name not in values:
+                usual = "arithmetic" if name[:3] == "sig" else "geometric"
+                mean = MEANS[mixing.get(name, usual)]
+                values[name] = mean(getattr(p, name), getattr(q, name))
+        return value_of(tree, values)
 
     return function
 

@@ -17,8 +17,8 @@ from zipfile import BadZipFile
 import numpy as np
 
 from rigidmd.compile import implements, kernel
+from rigidmd.features.potentials.expressions.trace import Number
 from rigidmd.features.potentials.poses.pairs import pair_slopes
-from rigidmd.features.potentials.poses.trace import Number
 from rigidmd.features.potentials.tables import start_errors, value_errors
 from rigidmd.units import KJ_PER_MOL
 

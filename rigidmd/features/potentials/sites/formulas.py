@@ -1,10 +1,10 @@
-"""Formulas of user pair potentials: from a function, from a table. `text_formulas` has those from a
-text."""
+"""Formulas of user pair potentials: from a text, from a function, from a table."""
 
 import contextlib
 import inspect
 import itertools
 from collections.abc import Callable, Mapping, Sequence
+from math import pi
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +12,15 @@ import numpy as np
 from rigidmd.compile import implements
 from rigidmd.compile.kernels import compile_user_function
 from rigidmd.errors import describe_error
+from rigidmd.features.potentials.expressions.radial import Radial as RadialFunctions
+from rigidmd.features.potentials.expressions.slopes import Hoisted, formula_module, function_of
+from rigidmd.features.potentials.expressions.text import (
+    FormulaError,
+    names_in,
+    parse_energy,
+    value_of,
+)
+from rigidmd.features.potentials.expressions.trace import Graph, TraceError
 from rigidmd.features.potentials.sites.custom import Table, Tabulated, energy_and_force_at
 from rigidmd.features.potentials.tables import reach_errors, start_errors, value_errors
 from rigidmd.units import KJ_PER_MOL
@@ -48,8 +57,70 @@ class Formula(NamedTuple):
     error: float = 0.0  # of the energy of a table, relative to its largest value in reach
 
 
-class FormulaError(ValueError):
-    """A formula that cannot be used, and why."""
+# --- from a text ----------------------------------------------------------------------------------
+
+
+def formula_of_text(energy: str, constants: Mapping[str, float] | None = None) -> Formula:
+    """The formula of an energy (kJ/mol) such as "A*exp(-B*r) - C/r**6", of r (Å) and named
+    parameters. The force is its derivative.
+
+    constants : values of parameters that are the same for all sites. Raises FormulaError.
+    """
+    numbers = {"pi": pi, **(constants or {})}
+    tree = parse_energy(energy)
+    names = [name for name in names_in(tree) if name not in numbers and name != DISTANCE]
+    graph = Graph()
+    leaves = {name: graph.leaf(name) for name in names}
+    r = graph.leaf(DISTANCE)
+    functions = RadialFunctions(r)
+    # a number is a node too
+    value = graph.constant(0.0) + value_of(tree, {**numbers, **leaves, DISTANCE: r})
+    try:
+        u = functions.sum_of_products(value, KJ_PER_MOL)
+        if not functions.depends_on_r(u):
+            raise FormulaError(f"{energy!r} does not depend on the distance {DISTANCE}")
+        outputs = [u, functions.fall(u)]
+        outputs.append(functions.fall(outputs[1]))
+    except TraceError as error:
+        raise FormulaError(f"{energy!r} cannot be differentiated: {error}") from None
+    hoisted = Hoisted(outputs[:2], names)
+    lines, texts, uses_root = functions.code_of(
+        outputs[:2], {index: f"formula.p{k}" for index, k in hoisted.places.items()}
+    )
+    module = formula_module(
+        repr(energy),
+        energy_and_force_at,
+        "formula, shared, r2, inverse1, inverse2",
+        lines,
+        f"{texts[0]}, {texts[1]} * inverse2",
+        inline=True,
+        fields=[f"p{k}" for k in range(len(hoisted.places))] or ["nothing"],
+        uses_root=uses_root,
+    )
+    by_place = {leaf.index: f"p[{k}]" for k, leaf in enumerate(leaves.values())}
+    values_at = function_of(outputs, "r, p", known=by_place)
+
+    def numbers_of(parameters: Mapping[str, float]) -> tuple[float, ...]:
+        try:
+            return tuple(hoisted.values(parameters)) or (0.0,)
+        except TraceError:
+            raise FormulaError("it has no finite real value") from None
+
+    def radial(parameters: Mapping[str, float]) -> Radial:
+        p = [parameters[name] for name in names]
+
+        def value(distance: float) -> tuple[float, float, float]:
+            try:
+                energy, fall, second = values_at(float(distance), p)
+                return energy, fall / distance, -(fall + second) / distance**2
+            except (ArithmeticError, ValueError):
+                raise FormulaError(
+                    f"it has no finite real value at {DISTANCE} = {distance:g} Å"
+                ) from None
+
+        return value
+
+    return Formula(energy, tuple(names), numbers_of, radial, module.Formula)
 
 
 # --- from a function ------------------------------------------------------------------------------

@@ -320,8 +320,8 @@ def _unknown_species(potential: BodyPairPotential, species: list[str]) -> list[s
 def _rows(potential: BodyPairPotential, kinds: list[str]) -> "tuple[PoseFormula, np.ndarray]":
     """The formula, and its numbers (kinds, kinds, numbers) for each pair of kinds. Raises
     PairPotentialError."""
+    from rigidmd.features.potentials.expressions.trace import TraceError
     from rigidmd.features.potentials.poses.formulas import formula_of_poses
-    from rigidmd.features.potentials.poses.trace import TraceError
 
     sets = [*potential.parameters.values(), *potential.pairs.values()]
     names = list(dict.fromkeys(key for values in sets for key in values))

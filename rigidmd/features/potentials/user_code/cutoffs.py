@@ -8,7 +8,7 @@ import numpy as np
 
 from rigidmd.assemble.plausibility import too_short
 from rigidmd.engines.system import System
-from rigidmd.features.potentials.sites.formulas import FormulaError
+from rigidmd.features.potentials.expressions.text import FormulaError
 from rigidmd.forces.potentials.truncation import MINIMUM_TOLERANCE
 from rigidmd.formats.cells import pairs_within
 from rigidmd.scene.truncation import TruncationName

@@ -14,6 +14,7 @@ from rigidmd.features.potentials.sites.formulas import (
     FormulaError,
     formula_of_function,
     formula_of_table,
+    formula_of_text,
 )
 from rigidmd.features.potentials.user_code.cutoffs import PairPotentialError
 from rigidmd.features.potentials.user_code.tables import Columns, read_columns
@@ -58,8 +59,6 @@ class PairPotential(UserForce):
                 r, energy, force, name = self.table
                 return formula_of_table(r, energy, cutoff, force, name)
             if isinstance(self.energy, str):
-                from rigidmd.features.potentials.sites.text_formulas import formula_of_text
-
                 return formula_of_text(self.energy, self.constants)
         except FormulaError as error:
             raise PairPotentialError(str(error)) from None
@@ -151,10 +150,6 @@ def pair_potential(
         name=DEFAULT_NAME if name == "<lambda>" else name,
         formula_of_function=formula,
     )
-
-
-#: The former name.
-pair_law = pair_potential
 
 
 def _check_names(

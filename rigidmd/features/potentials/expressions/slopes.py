@@ -4,11 +4,15 @@ Slopes follow from the graph by reverse differentiation, as further nodes. `code
 lines of Python, which are compiled.
 """
 
+import math
 from collections.abc import Callable, Container, Mapping, Sequence
+from types import ModuleType
 
 import numpy as np
 
-from rigidmd.features.potentials.poses.trace import Number, Traced, computed, where
+from rigidmd.compile import kernel
+from rigidmd.core.user_modules import module_of
+from rigidmd.features.potentials.expressions.trace import Number, Traced, choose, computed
 
 #: Kind of a node -> its code.
 _CODE = {
@@ -18,29 +22,10 @@ _CODE = {
     "divide": "({} / {})",
     "negative": "(-{})",
     "less": "({} < {})",
-    "where": "({1} if {0} else {2})",
-}
-#: Kind of a node -> its values in NumPy.
-_ARRAYS: dict[str, Callable] = {
-    "add": np.add,
-    "subtract": np.subtract,
-    "multiply": np.multiply,
-    "divide": np.divide,
-    "negative": np.negative,
-    "sqrt": np.sqrt,
-    "exp": np.exp,
-    "log": np.log,
-    "sin": np.sin,
-    "cos": np.cos,
-    "tanh": np.tanh,
-    "acos": np.arccos,
-    "fabs": np.fabs,
-    "power": np.power,
-    "less": np.less,
-    "where": np.where,
+    "where": "where({}, {}, {})",
 }
 #: Kind of a node -> its slopes by its parts: a function of the node and of the parts.
-_SLOPES: dict[str, Callable] = {
+SLOPES: dict[str, Callable] = {
     "add": lambda node, x, y: (1.0, 1.0),
     "subtract": lambda node, x, y: (1.0, -1.0),
     "multiply": lambda node, x, y: (y, x),
@@ -53,8 +38,12 @@ _SLOPES: dict[str, Callable] = {
     "cos": lambda node, x: (-x.sin(),),
     "tanh": lambda node, x: (1 - node * node,),
     "acos": lambda node, x: (-1 / (1 - x * x).sqrt(),),
-    "fabs": lambda node, x: (where(x < 0.0, -1.0, 1.0),),
-    "power": lambda node, x: (node.parts[1] * x ** (node.parts[1] - 1),),
+    "fabs": lambda node, x: (choose(x < 0.0, -1.0, 1.0),),
+    "erfc": lambda node, x: (-2 / math.sqrt(math.pi) * (-x * x).exp(),),
+    "power": lambda node, x, *y: (
+        node.parts[1] * x ** (node.parts[1] - 1),
+        *(node * x.log() for _ in y),
+    ),
     "less": lambda node, x, y: (0.0, 0.0),
 }
 
@@ -62,15 +51,15 @@ _SLOPES: dict[str, Callable] = {
 def slopes_of(output: Traced, leaves: Sequence[Traced]) -> list[Number]:
     """The slopes of a node by leaves; 0.0 by one on which it does not depend."""
     slope: dict[int, Number] = {output.index: 1.0}
-    for node in reversed(_in_order([output])):
+    for node in reversed(in_order([output])):
         above = slope.get(node.index, 0.0)
         if not node.inner or (isinstance(above, float) and above == 0):
             continue
         if node.kind == "where":
             condition, yes, no = node.parts
-            terms = [(yes, where(condition, above, 0.0)), (no, where(condition, 0.0, above))]
+            terms = [(yes, choose(condition, above, 0.0)), (no, choose(condition, 0.0, above))]
         else:
-            factors = _SLOPES[node.kind](node, *node.inner)
+            factors = SLOPES[node.kind](node, *node.inner)
             terms = [
                 (part, above * factor) for part, factor in zip(node.inner, factors, strict=True)
             ]
@@ -79,7 +68,7 @@ def slopes_of(output: Traced, leaves: Sequence[Traced]) -> list[Number]:
     return [slope.get(leaf.index, 0.0) for leaf in leaves]
 
 
-def _in_order(outputs: Sequence[Traced], known: Container[int] = ()) -> list[Traced]:
+def in_order(outputs: Sequence[Traced], known: Container[int] = ()) -> list[Traced]:
     """The nodes that the outputs need, each after those that it needs; not what only known nodes
     need."""
     needed: dict[int, Traced] = {}
@@ -93,7 +82,7 @@ def _in_order(outputs: Sequence[Traced], known: Container[int] = ()) -> list[Tra
 
 
 def code_of(
-    outputs: Sequence[Number], known: dict[int, str] | None = None
+    outputs: Sequence[Number], known: Mapping[int, str] | None = None
 ) -> tuple[list[str], list[str]]:
     """Lines that compute the nodes, and the text of each output, a node or a number.
 
@@ -102,7 +91,7 @@ def code_of(
     nodes = [output for output in outputs if isinstance(output, Traced)]
     names: dict[int, str] = dict(known or {})
     lines: list[str] = []
-    for node in _in_order(nodes, names):
+    for node in in_order(nodes, names):
         if node.index in names:
             continue
         if node.kind == "leaf":
@@ -119,41 +108,35 @@ def code_of(
     return lines, texts
 
 
-def values_of(
-    outputs: Sequence[Number], leaves: Mapping[str, np.ndarray], known: Mapping[int, float]
-) -> list[np.ndarray]:
-    """The outputs at the values (m,) of leaves, as compiled code computes them: NaN and inf where
-    they are not finite.
+def function_of(
+    outputs: Sequence[Number],
+    arguments: str,
+    functions: ModuleType = math,
+    known: Mapping[int, str] | None = None,
+) -> Callable[..., list]:
+    """The outputs as a function of Python: of numbers, or with NumPy of arrays, whose values are
+    NaN or inf where they are not finite.
 
-    known : values of nodes that are not computed here, by their indices
+    arguments : names of which the leaves are expressions; known : as for `code_of`
     """
-    values: dict[int, np.ndarray | float] = dict(known)
-    with np.errstate(all="ignore"):
-        for node in _in_order([x for x in outputs if isinstance(x, Traced)], known):
-            if node.index in values:
-                continue
-            if node.kind == "leaf":
-                values[node.index] = leaves[node.parts[0]]
-            elif node.number is not None:
-                values[node.index] = node.number
-            else:
-                parts = [values[x.index] if isinstance(x, Traced) else x for x in node.parts]
-                values[node.index] = _ARRAYS[node.kind](*parts)
-    count = len(next(iter(leaves.values())))
-    return [
-        np.broadcast_to(values[x.index] if isinstance(x, Traced) else x, count) for x in outputs
-    ]
+    lines, texts = code_of(outputs, known)
+    body = "; ".join([*lines, f"return [{', '.join(texts)}]"])
+    scope = {**vars(functions), "erfc": np.vectorize(math.erfc, otypes=[float])}
+    exec(f"def values({arguments}): {body}", scope)
+    return np.errstate(all="ignore")(scope["values"])
 
 
 def _expression(node: Traced, names: dict[int, str]) -> str:
     parts = [names[part.index] for part in node.inner]
-    if node.kind == "power":
-        exponent = node.parts[1]
+    exponent = node.parts[1] if node.kind == "power" else None
+    if isinstance(exponent, float):
         if exponent == round(exponent) and abs(exponent) <= 64:
             whole = f"{parts[0]} ** {int(abs(exponent))}"
             # a negative power of 0 would raise ZeroDivisionError in compiled code
             return whole if exponent > 0 else f"1.0 / {whole}"
         return f"pow({parts[0]}, {exponent!r})"
+    if exponent is not None:
+        return f"pow({', '.join(parts)})"
     if node.kind in _CODE:
         return _CODE[node.kind].format(*parts)
     return f"{node.kind}({', '.join(parts)})"
@@ -167,7 +150,7 @@ class Hoisted:
     """
 
     def __init__(self, outputs: Sequence[Number], names: Sequence[str]):
-        nodes = _in_order([output for output in outputs if isinstance(output, Traced)])
+        nodes = in_order([output for output in outputs if isinstance(output, Traced)])
         fixed: set[int] = set()
         for node in nodes:
             if node.kind == "leaf":
@@ -187,7 +170,7 @@ class Hoisted:
     def values(self, parameters: dict[str, float]) -> list[float]:
         """The numbers of a pair of kinds, from its parameters by name. Raises TraceError."""
         known: dict[int, float] = {}
-        for node in _in_order(self._nodes):
+        for node in in_order(self._nodes):
             if node.kind == "leaf":
                 known[node.index] = parameters[node.parts[0]]
             elif node.number is not None:
@@ -198,3 +181,49 @@ class Hoisted:
                 ]
                 known[node.index] = computed(node.kind, parts)
         return [known[node.index] for node in self._nodes]
+
+
+def formula_module(
+    name: str,
+    function: Callable[..., object],
+    arguments: str,
+    lines: Sequence[str],
+    returned: str,
+    *,
+    inline: bool = False,
+    fields: Sequence[str] = ("nothing",),
+    uses_root: bool = True,
+) -> ModuleType:
+    """A module with a NamedTuple class `Formula`, with fields and `uses_root`, and the
+    implementation of a function for it.
+
+    arguments, lines, returned : of that function
+    """
+    body = "\n".join(f"    {line}" for line in lines)
+    source = f"""\
+# {name}, written by rigidmd
+from math import acos, cos, exp, fabs, log, pow, sin, sqrt, tanh
+from typing import NamedTuple
+
+from rigidmd.compile import implements
+from {__name__} import where
+from {function.__module__} import {function.__name__}
+
+
+class Formula(NamedTuple):
+    {"; ".join(f"{field}: float = 0.0" for field in fields)}
+    uses_root = {uses_root}
+
+
+@implements({function.__name__}, Formula, inline={inline})
+def _of_formula({arguments}):
+{body}
+    return {returned}
+"""
+    return module_of(source.encode(), f"<potential {name}>")
+
+
+@kernel(inline=True, from_python=True)
+def where(condition, x, y):
+    """`where` in the code of formulas."""
+    return x if condition else y

@@ -38,14 +38,18 @@ class Graph:
         short = _SIMPLER[kind](self, *parts) if kind in _SIMPLER else None
         return self._node(kind, parts) if short is None else short
 
-    def power(self, base: "Traced", exponent: float) -> "Traced":
+    def power(self, base: "Traced", exponent: "Traced") -> "Traced":
+        """A constant exponent is a number in the node."""
+        n = exponent.number
+        if n is None:
+            return self._node("power", (base, exponent))
         if base.number is not None:
-            return self.constant(computed("power", [base.number, exponent]))
-        if exponent in (0.0, 1.0):
-            return base if exponent else self.constant(1.0)
-        if exponent == 0.5:
+            return self.constant(computed("power", [base.number, n]))
+        if n in (0.0, 1.0):
+            return base if n else self.constant(1.0)
+        if n == 0.5:
             return self.node("sqrt", base)
-        return self._node("power", (base, exponent))
+        return self._node("power", (base, n))
 
     def _node(self, kind: str, parts: tuple) -> "Traced":
         key = (kind, *(id(part) if isinstance(part, Traced) else part for part in parts))
@@ -111,10 +115,7 @@ class Traced:
     def __pow__(self, exponent: "Number | np.ndarray"):
         if isinstance(exponent, np.ndarray):
             return NotImplemented
-        known = self._other(exponent)
-        if known.number is None:
-            return (known * self.log()).exp()
-        return self.graph.power(self, known.number)
+        return self.graph.power(self, self._other(exponent))
 
     def __rpow__(self, base: "Number"):
         return self._other(base) ** self
@@ -157,6 +158,9 @@ class Traced:
     def arccos(self):
         return self.graph.node("acos", self)
 
+    def erfc(self):
+        return self.graph.node("erfc", self)
+
     def absolute(self):
         return self.graph.node("fabs", self)
 
@@ -179,8 +183,8 @@ class Traced:
             first, second = map(self._other, inputs)
             is_less = first < second
             if name == "maximum":
-                return where(is_less, second, first)
-            return where(is_less, first, second)
+                return choose(is_less, second, first)
+            return choose(is_less, first, second)
         if hasattr(self, name) and len(inputs) == 1:
             return getattr(self, name)()
         raise TraceError(f"numpy.{name} has no slope here: use {', '.join(FUNCTIONS)}")
@@ -193,7 +197,7 @@ class Traced:
         options: Mapping[str, object],
     ):
         if function is np.where and len(arguments) == 3:
-            return where(*arguments)
+            return choose(*arguments)
         return NotImplemented
 
 
@@ -217,7 +221,7 @@ def _each(function: Callable, *arrays: np.ndarray) -> np.ndarray:
     return result
 
 
-def where(condition: Number, yes: Number, no: Number) -> Number:
+def choose(condition: Number, yes: Number, no: Number) -> Number:
     """`yes` or `no`; both are computed."""
     if not isinstance(condition, Traced):
         return yes if condition else no
