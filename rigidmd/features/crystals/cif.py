@@ -6,19 +6,17 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rigidmd.core.toml import parse_whole_number
 from rigidmd.features.crystals.cif_syntax import parse_cif, tag_of
 from rigidmd.features.crystals.crystal import (
-    IDENTITY,
     NoSymmetry,
-    Setting,
     Statement,
     UnitCell,
-    canonical,
-    is_group,
+    group_of,
     keep_cell,
     name_of,
     parse_operation,
@@ -43,6 +41,9 @@ from rigidmd.formats.atoms import (
 )
 from rigidmd.formats.cells import cell_error, cell_of, describe_cell
 from rigidmd.units import GRAM_PER_CM3
+
+if TYPE_CHECKING:
+    import gemmi
 
 #: Occupancies of at least this, or within their uncertainty of 1, are 1.
 FULL = 0.999
@@ -176,11 +177,12 @@ def _structure(path: Path, block: Block, rows: list[int], syntax: list[str]) -> 
         reason = "its atoms are disordered, or have another symmetry than it states"
         raise structure_error(path, f"{error} in the cell: {reason}{_as_read(notes)}") from None
     owner = contents.source_atom
-    notes += _contents(block, kinds, contents, cell, len(operations))
+    order = len(operations) if operations else 1
+    notes += _contents(block, kinds, contents, cell, order)
     return Atoms(
         [names[k] for k in owner],
         [elements[k] for k in owner],
-        [residue[k] for k in owner] if len(operations) == 1 else [()] * len(owner),
+        [residue[k] for k in owner] if order == 1 else [()] * len(owner),
         contents.fractional @ cell,
         cell=cell,
         notes=notes,
@@ -380,8 +382,10 @@ def _to_fractional(block: Block, position: np.ndarray, cell: np.ndarray) -> np.n
     return position @ standard.T if is_standard else position @ w.T + t
 
 
-def _symmetry(path: Path, block: Block, cell: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """The symmetry operations (g, 3, 4), and notes on where they are from.
+def _symmetry(
+    path: Path, block: Block, cell: np.ndarray
+) -> "tuple[gemmi.GroupOps | None, list[str]]":
+    """The symmetry operations, None for the identity alone, and notes on where they are from.
 
     The list of operations of a file defines the symmetry. Without one it is defined by its Hall
     symbol, its Hermann-Mauguin symbol, or the number of its space group, in this order. Statements
@@ -396,14 +400,14 @@ def _symmetry(path: Path, block: Block, cell: np.ndarray) -> tuple[np.ndarray, l
         note = (
             "no symmetry operations in the file: its atoms were taken as all atoms of the unit cell"
         )
-        return IDENTITY, [note] if is_crystal else []
+        return None, [note] if is_crystal else []
     used, *others = statements
-    settings = [setting for setting in used.settings if keep_cell(setting.operations, cell)]
+    settings = [setting for setting in used.settings if keep_cell(setting, cell)]
     if not settings:
         raise structure_error(path, f"{used.what} cannot be in its cell, {describe_cell(cell)}")
     contradicting = []
     for other in others:
-        if agreeing := [setting for setting in settings if other.agrees(setting.operations)]:
+        if agreeing := [setting for setting in settings if setting in other.settings]:
             settings = agreeing
         else:
             contradicting.append(other)
@@ -412,7 +416,6 @@ def _symmetry(path: Path, block: Block, cell: np.ndarray) -> tuple[np.ndarray, l
         what = " and ".join([used.what, *(other.what for other in contradicting)])
         advice = f"correct one of them, or list the operations ({OPERATIONS[0]})"
         raise structure_error(path, f"{what} contradict each other: {advice}")
-    operations = settings[0].operations
     notes = [_described(settings, used)]
     if contradicting:
         notes.append(
@@ -420,11 +423,11 @@ def _symmetry(path: Path, block: Block, cell: np.ndarray) -> tuple[np.ndarray, l
         )
     system = block.first(*SYSTEMS)
     of_system = settings_of_system(system) if system else []
-    if of_system and not any(keep_cell(setting.operations, cell) for setting in of_system):
+    if of_system and not any(keep_cell(setting, cell) for setting in of_system):
         notes.append(f"its cell, {describe_cell(cell)}, is not {system}, as the file states")
     if not is_listed:
         notes += [f"{what} is unknown" for what in _unknown(block)]
-    return operations, notes
+    return settings[0], notes
 
 
 def _unknown(block: Block) -> Iterator[str]:
@@ -444,25 +447,25 @@ def _unknown(block: Block) -> Iterator[str]:
         yield f"its crystal system {system}"
 
 
-def _described(settings: list[Setting], used: Statement) -> str:
+def _described(settings: "list[gemmi.GroupOps]", used: Statement) -> str:
     """Where the operations of the first setting are from, and which other ones the file may
     mean."""
     chosen, *possible = settings
-    if used.what == LISTED and len(chosen.operations) == 1:
+    if used.what == LISTED and len(chosen) == 1:
         return "x,y,z is the only symmetry operation in the file"
-    count = f"{len(chosen.operations)} symmetry operation{'s' * (len(chosen.operations) > 1)}"
+    count = f"{len(chosen)} symmetry operation{'s' * (len(chosen) > 1)}"
     if used.what == LISTED:
-        name = name_of(chosen.operations)
+        name = name_of(chosen)
         return f"{count} in the file" + (f", which are those of {name}" if name else "")
     note = f"{count} of {used.what}, as the file lists none"
     if not possible:
         return note
-    names = ", ".join(setting.name for setting in possible[:MOST_LISTED]) + (
+    names = ", ".join(name_of(setting) for setting in possible[:MOST_LISTED]) + (
         ", ..." if possible[MOST_LISTED:] else ""
     )
     return (
-        f"{note}: the setting {chosen.name} was assumed, which the file does not state (it may be"
-        f" {names})"
+        f"{note}: the setting {name_of(chosen)} was assumed, which the file does not state (it may"
+        f" be {names})"
     )
 
 
@@ -481,19 +484,20 @@ def _listed(path: Path, block: Block) -> Iterator[Statement]:
                 )
                 raise structure_error(path, message) from None
         if operations:
-            lists.append(canonical(operations))
+            lists.append(operations)
     if not lists:
         return
-    if len(lists) > 1 and not np.array_equal(*lists):
+    groups = [group_of(operations) for operations in lists]
+    if groups[0] != groups[-1]:
         raise structure_error(
             path, f"its two lists of operations differ, {' and '.join(OPERATIONS)}: keep one"
         )
-    if not is_group(lists[0]):
-        count = len(lists[0])
+    if groups[0] is None:
+        count = len(set(lists[0]))
         raise structure_error(
             path, f"its {count} symmetry operations are not a group: is one missing or misprinted?"
         )
-    yield Statement(LISTED, [Setting(LISTED, lists[0])])
+    yield Statement(LISTED, [groups[0]])
 
 
 def _tabulated(block: Block) -> Iterator[Statement]:

@@ -8,8 +8,7 @@ Source: International Tables for Crystallography A, chapters 1.3 to 1.5.
 """
 
 import re
-from collections.abc import Callable, Iterable, Sequence
-from functools import cache
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -37,27 +36,11 @@ class NoSymmetry(Exception):
     """Symmetry and positions contradict each other."""
 
 
-class Setting(NamedTuple):
-    """Operations that a file may mean."""
-
-    name: str
-    operations: np.ndarray  # (g, 3, 4)
-
-
 class Statement(NamedTuple):
     """What a file states about its symmetry, and the settings in which it holds."""
 
     what: str  # for messages
-    settings: Sequence[Setting]
-
-    def agrees(self, operations: np.ndarray) -> bool:
-        return any(np.array_equal(operations, setting.operations) for setting in self.settings)
-
-
-def canonical(operations: "Iterable[gemmi.Op]") -> np.ndarray:
-    """Operations (g, 3, 4), sorted, each once, with translations from 0 to 1."""
-    rows = [[[*w, t % WHOLE] for w, t in zip(op.rot, op.tran, strict=True)] for op in operations]
-    return np.unique(np.array(rows, int), axis=0)
+    settings: "Sequence[gemmi.GroupOps]"
 
 
 def parse_operation(text: str) -> "gemmi.Op":
@@ -68,96 +51,72 @@ def parse_operation(text: str) -> "gemmi.Op":
         operation = gemmi.Op(re.sub(r"\s", "", text))
     except RuntimeError as error:
         raise ValueError(str(error)) from None
-    if abs(round(np.linalg.det(np.array(operation.rot) / WHOLE), 6)) != 1:
+    if abs(operation.det_rot()) != WHOLE**3:
         raise ValueError("it is neither a rotation nor a reflection")
-    return operation
+    return operation.wrap()
 
 
-def is_group(operations: np.ndarray) -> bool:
-    """Whether the products of any two operations are these operations."""
-    w, t = operations[:, :, :3] // WHOLE, operations[:, :, 3]
-    rotation = WHOLE * np.einsum("aij,bjk->abik", w, w)
-    translation = (np.einsum("aij,bj->abi", w, t) + t[:, None]) % WHOLE
-    products = np.concatenate([rotation, translation[..., None]], axis=3).reshape(-1, 3, 4)
-    return np.array_equal(np.unique(products, axis=0), operations)
+def group_of(operations: "Sequence[gemmi.Op]") -> "gemmi.GroupOps | None":
+    """The group of operations. None if a product of two of them is none of them."""
+    import gemmi
+
+    group = gemmi.GroupOps(operations)
+    try:
+        group.add_missing_elements()
+    except RuntimeError:  # infinitely many
+        return None
+    return group if len(group) == len({operation.triplet() for operation in operations}) else None
 
 
-def keep_cell(operations: np.ndarray, cell: np.ndarray) -> bool:
+def keep_cell(operations: "gemmi.GroupOps", cell: np.ndarray) -> bool:
     """Whether operations are rotations and reflections in this cell (3, 3): W^T G W = G for its
     metric tensor G."""
     metric = cell @ cell.T
-    w = operations[:, :, :3] / WHOLE
+    w = np.array([operation.rot for operation in operations.sym_ops]) / WHOLE
     change = np.einsum("aji,jk,akl->ail", w, metric, w) - metric
     return bool(np.abs(change).max() <= KEEPS_CELL * metric.max())
 
 
-class TableEntry(NamedTuple):
-    """A setting of a space group in gemmi's table."""
-
-    setting: Setting
-    number: int
-    symbol: str  # Hermann-Mauguin, without origin or cell
-    keys: frozenset[str]  # its spellings without spaces; for monoclinic groups also without 1s
-    codes: frozenset[str]  # coordinate system codes
-    system: str
-
-
-@cache
-def _table() -> list[TableEntry]:
-    """All settings of the space groups: standard ones, origin choice 1 and hexagonal cells come
-    first."""
+def settings_where(wanted: "Callable[[gemmi.SpaceGroup], object]") -> "list[gemmi.GroupOps]":
+    """Settings of space groups. Standard ones, origin choice 1 and hexagonal cells come first."""
     import gemmi
 
-    return [_entry(group) for group in gemmi.spacegroup_table()]
+    return [group.operations() for group in gemmi.spacegroup_table() if wanted(group)]
 
 
-def _entry(group: "gemmi.SpaceGroup") -> TableEntry:
-    keys = {_key(group.hm)}
-    if group.number in MONOCLINIC:
-        keys.add("".join(word for word in group.hm.split() if word != "1").lower())
-    origin = group.ext.lower()
-    return TableEntry(
-        Setting(group.xhm(), canonical(group.operations())),
-        group.number,
-        group.hm,
-        frozenset(keys),
-        frozenset({origin, group.qualifier, origin + group.qualifier}),
-        group.crystal_system_str(),
-    )
+def settings_of_number(number: int) -> "list[gemmi.GroupOps]":
+    return settings_where(lambda group: group.number == number)
 
 
-def settings_where(wanted: Callable[[TableEntry], bool]) -> list[Setting]:
-    return [entry.setting for entry in _table() if wanted(entry)]
-
-
-def settings_of_number(number: int) -> list[Setting]:
-    return settings_where(lambda entry: entry.number == number)
-
-
-def settings_of_system(system: str) -> list[Setting]:
+def settings_of_system(system: str) -> "list[gemmi.GroupOps]":
     """Settings of a crystal system. Hexagonal, trigonal and rhombohedral ones are not distinguished
     in files."""
     alike = ("hexagonal", "trigonal", "rhombohedral")
     systems = alike if system.lower() in alike else (system.lower(),)
-    return settings_where(lambda entry: entry.system in systems)
+    return settings_where(lambda group: group.crystal_system_str() in systems)
 
 
-def settings_of_code(code: str) -> list[Setting]:
+def settings_of_code(code: str) -> "list[gemmi.GroupOps]":
     """Settings of a coordinate system code of International Tables, such as 2, b2, 1cab or -cba."""
-    return settings_where(lambda entry: code.lower() in entry.codes)
+    return settings_where(lambda group: _has_code(group, code))
 
 
-def settings_of_hall(symbol: str) -> list[Setting]:
+def _has_code(group: "gemmi.SpaceGroup", code: str) -> bool:
+    origin = group.ext.lower()
+    return code.lower() in (origin, group.qualifier, origin + group.qualifier)
+
+
+def settings_of_hall(symbol: str) -> "list[gemmi.GroupOps]":
     """The setting of a Hall symbol. None if it is unreadable."""
     import gemmi
 
     try:
-        return [Setting(symbol, canonical(gemmi.symops_from_hall(symbol)))]
+        return [gemmi.symops_from_hall(symbol)]
     except RuntimeError:
         return []
 
 
-def settings_of_name(name: str) -> list[Setting]:
+def settings_of_name(name: str) -> "list[gemmi.GroupOps]":
     """The settings that a Hermann-Mauguin symbol may mean. None if it is unknown.
 
     Spaces, underscores, 2(1) and 2~1~ are understood, also full symbols (P 2/m 2/m 2/m), and
@@ -168,25 +127,25 @@ def settings_of_name(name: str) -> list[Setting]:
 
     plain = re.sub(r"[()~_]", "", re.sub(r"\(?(No\.?|#) *\d+\)?$", "", name.strip()))
     symbol, _, code = (part.strip() for part in plain.partition(":"))
-    attempts = [(symbol, code.lower())]
+    attempts = [(symbol, code)]
     words = symbol.split()
     if not code and words[-1:] and words[-1].upper() in SUFFIXES:
         attempts.append((" ".join(words[:-1]), SUFFIXES[words[-1].upper()]))
     for symbol, code in attempts:
-        for key in (_key(symbol), _short(_key(symbol))):
-            if settings := [
-                entry.setting
-                for entry in _table()
-                if key in entry.keys and (not code or code in entry.codes)
-            ]:
+        key = _key(symbol)
+        # short symbols of full ones: pnma of p21/n21/m21/a, fm-3m of f4/m-32/m
+        for spelling in (key, re.sub(r"(?:21?|4[1-3]?(?=/[a-z]-3))/([a-z])", r"\1", key)):
+            if settings := settings_where(
+                lambda group, spelling=spelling, code=code: (
+                    spelling in _spellings(group) and (not code or _has_code(group, code))
+                )
+            ):
                 return settings
     symbol, code = attempts[0]
     # other symbols of the same setting: H 3, F d 3 m, C m c e
-    group = gemmi.find_spacegroup_by_name(symbol)
-    if group is None:
-        return []
+    named = gemmi.find_spacegroup_by_name(symbol)
     return settings_where(
-        lambda entry: entry.symbol == group.hm and (not code or code in entry.codes)
+        lambda group: named and group.hm == named.hm and (not code or _has_code(group, code))
     )
 
 
@@ -194,15 +153,18 @@ def _key(symbol: str) -> str:
     return re.sub(r"\s", "", symbol).lower()
 
 
-def _short(key: str) -> str:
-    """The short symbol of a full one: pnma of p21/n21/m21/a, fm-3m of f4/m-32/m."""
-    return re.sub(r"(?:21?|4[1-3]?(?=/[a-z]-3))/([a-z])", r"\1", key)
+def _spellings(group: "gemmi.SpaceGroup") -> tuple[str, ...]:
+    """The symbol of a group without spaces, and for monoclinic groups also without 1s."""
+    words = group.hm.split() if group.number in MONOCLINIC else ()
+    return _key(group.hm), "".join(word for word in words if word != "1").lower()
 
 
-def name_of(operations: np.ndarray) -> str:
-    """The space group of operations (g, 3, 4), or an empty text if it is in no table."""
-    same = settings_where(lambda entry: np.array_equal(entry.setting.operations, operations))
-    return same[0].name if same else ""
+def name_of(operations: "gemmi.GroupOps") -> str:
+    """The space group of operations, or an empty text if it is in no table."""
+    import gemmi
+
+    group = gemmi.find_spacegroup_by_ops(operations)
+    return group.xhm() if group else ""
 
 
 class UnitCell(NamedTuple):
@@ -218,15 +180,17 @@ def unit_cell(
     fractional: np.ndarray,
     kinds: Sequence[str],
     radii: np.ndarray,
-    operations: np.ndarray,
+    group: "gemmi.GroupOps | None",
     cell: np.ndarray,
 ) -> UnitCell:
     """All atoms of the cell (3, 3), each once. Atoms on special positions are put exactly there.
 
     fractional : (n, 3) coordinates of the atoms of the file. kinds : what atoms at one position
         must share.
-    radii : (n,) covalent radii, Å. Raises NoSymmetry.
+    radii : (n,) covalent radii, Å. group : None for the identity alone. Raises NoSymmetry.
     """
+    rows = [[[*w, t] for w, t in zip(op.rot, op.tran, strict=True)] for op in group or ()]
+    operations = np.unique(np.array(rows, int), axis=0) if group else IDENTITY
     parts = [
         _images(x, SAME_ATOM * radius, operations, cell)
         for x, radius in zip(fractional, radii, strict=True)
