@@ -47,7 +47,7 @@ class Row:
     kind: str = ""
     kind_title: str = ""  # of its examples
     commands: tuple[str, ...] = ()  # modules of its folder `commands`
-    formats: tuple[str, ...] = ()  # modules that register file formats
+    formats: tuple[str, ...] = ()  # modules that register file formats, and the extensions of these
     analyses: tuple[str, ...] = ()  # modules that register analyses
     #: Modules that have the name of an analysis which needs no run, with `results_of_scene`
     scene_analyses: tuple[str, ...] = ()

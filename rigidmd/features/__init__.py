@@ -58,7 +58,7 @@ FEATURES = (
     Row(
         "crystals",
         "CIF and symmetry, and the formats that liquids do not need",
-        formats=("cif", "g96", "gsd", "lammps"),
+        formats=("cif cif mmcif", "g96 g96", "gsd gsd", "lammps data lmp lammps"),
     ),
     Row(
         "monte_carlo",
@@ -80,8 +80,8 @@ FEATURES = (
 
 
 def modules(kind: str) -> Iterator[tuple[str, str]]:
-    """(name, full name) of the modules of installed features that add "commands", "formats",
-    "analyses", "sweep_analyses", "scene_analyses", "thermostats" or "barostats"."""
+    """(name, full name) of the modules of installed features that add "commands", "analyses",
+    "sweep_analyses", "scene_analyses", "thermostats" or "barostats"."""
     for row in FEATURES:
         if getattr(row, kind) and row.is_installed:
             folder = f"{row.package}.commands" if kind == "commands" else row.package

@@ -1,13 +1,13 @@
 """File formats of structures and trajectories: a module here registers its formats, and states
 everything about them.
 
-No other code of rigidmd names an extension. A module in this folder is found by being there, and
-features list theirs.
+No other code of rigidmd names an extension. A module in this folder is found by being there. A
+feature lists its modules with their extensions, and they are imported when one of these is used.
 `register` adds a format from outside.
 """
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
 from math import inf
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
-from rigidmd.features import FEATURES, modules
+from rigidmd.features import FEATURES
 from rigidmd.formats.atoms import Atoms, Frame
 from rigidmd.formats.systems import Placed
 
@@ -110,8 +110,22 @@ class Format(NamedTuple):
         return least if positions.min() < least else largest if positions.max() > largest else None
 
 
-#: Formats by extension, and formats that are recognised by their content.
-BY_EXTENSION: dict[str, Format] = {}
+class _Formats(dict[str, Format]):
+    """Formats by extension. Those of features are loaded at their first use."""
+
+    def __missing__(self, extension: str) -> Format:
+        """Raises KeyError for an unknown extension, MissingFeatureError for one of a feature that
+        is absent."""
+        for row in FEATURES:
+            for module, *names in map(str.split, row.formats):
+                if extension[1:] in names:
+                    row.module(module, f"*{extension}")
+                    return super().__getitem__(extension)
+        raise KeyError(extension)
+
+
+BY_EXTENSION = _Formats()
+#: Formats that are recognised by their content.
 BY_CONTENT: list[Format] = []
 #: Default names of files of a run, of the topology of a body, with bonds, and of the `ase.Atoms` of
 #: a scene.
@@ -128,22 +142,21 @@ def register(form: Format) -> None:
         BY_CONTENT.append(form)
 
 
-def find_modules() -> None:
-    """Import the modules of this package and of features, which register their formats."""
-    names = {module.name: f"{__name__}.{module.name}" for module in iter_modules(__path__)}
-    names |= modules("formats")
-    for _, name in sorted(names.items()):
-        import_module(name)
+def all_formats() -> Iterator[Format]:
+    """Every format once, those of installed features included."""
+    for row in FEATURES:
+        for module in (names.split()[0] for names in row.formats if row.is_installed):
+            row.module(module)
+    return iter(dict.fromkeys((*BY_CONTENT, *BY_EXTENSION.values())))
 
 
 def format_of(path: str | Path) -> Format | None:
     """The format of a file by its extension. None for one that only ASE may know, or nobody.
     Raises MissingFeatureError for one of a feature that is absent."""
-    extension = Path(path).suffix.lower()
-    for row in FEATURES:
-        if extension[1:] in row.formats and not row.is_installed:
-            raise row.missing(str(path))
-    return BY_EXTENSION.get(extension)
+    try:
+        return BY_EXTENSION[Path(path).suffix.lower()]
+    except KeyError:
+        return None
 
 
 def has_types(path: str | Path) -> bool:
@@ -154,7 +167,7 @@ def has_types(path: str | Path) -> bool:
 
 def extensions(wanted: Callable[[Format], object]) -> tuple[str, ...]:
     """Sorted extensions of the formats for which `wanted` is true."""
-    return tuple(sorted(name for name, form in BY_EXTENSION.items() if wanted(form)))
+    return tuple(sorted(name for form in all_formats() if wanted(form) for name in form.extensions))
 
 
 def written(wanted: Callable[[Format], object]) -> tuple[str, ...]:
@@ -162,6 +175,15 @@ def written(wanted: Callable[[Format], object]) -> tuple[str, ...]:
     return tuple(name for name in extensions(wanted) if name == BY_EXTENSION[name].extensions[0])
 
 
+def topologies() -> tuple[str, ...]:
+    """Names of topology files that are found next to a trajectory, as in the folder of a run."""
+    return tuple(f"{Path(TOPOLOGY).stem}{name}" for name in written(lambda form: form.topology))
+
+
+def find_modules() -> None:
+    """Import the modules of this package, which register their formats."""
+    for module in iter_modules(__path__):
+        import_module(f"{__name__}.{module.name}")
+
+
 find_modules()
-#: Names of topology files that are found next to a trajectory, as in the folder of a run.
-TOPOLOGIES = tuple(f"{Path(TOPOLOGY).stem}{name}" for name in written(lambda form: form.topology))

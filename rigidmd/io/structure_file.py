@@ -16,7 +16,7 @@ import numpy as np
 from rigidmd.core.files import unreadable_reason
 from rigidmd.core.process import format_gigabytes, memory_shortage
 from rigidmd.errors import UNPRINTABLE
-from rigidmd.formats import BY_CONTENT, BY_EXTENSION, TOPOLOGIES, Format, format_of
+from rigidmd.formats import Format, all_formats, format_of, topologies
 from rigidmd.formats.atoms import HEAVY_HYDROGEN, Atoms, element_of, structure_error, with_elements
 from rigidmd.formats.through_ase import from_ase, read_by_ase, read_text_by_ase
 from rigidmd.formats.through_mdanalysis import index_of, read_in_process
@@ -108,7 +108,7 @@ def _read_trajectory(
             raise structure_error(path, _no_types())
         return not_none(form.read_frame)(path, frame, *([atom_types] if form.has_types else []))
     if topology is None:
-        missing = f"there is no {' or '.join(TOPOLOGIES)} next to it"
+        missing = f"there is no {' or '.join(topologies())} next to it"
         raise structure_error(
             path, f"holds no names of atoms, and {missing}: name a file by structure.topology"
         )
@@ -120,9 +120,8 @@ def _read_trajectory(
 
 
 def _no_types() -> str:
-    forms = dict.fromkeys((*BY_CONTENT, *BY_EXTENSION.values()))
-    names = [form.name or " ".join(form.extensions) for form in forms if form.has_types]
-    return f"structure.atom_types is for formats whose atoms have types: {', '.join(names)}"
+    names = [form.name or " ".join(form.extensions) for form in all_formats() if form.has_types]
+    return f"structure.atom_types is for formats whose atoms have types: {', '.join(sorted(names))}"
 
 
 def read_geometry(path: Path, vocabulary: frozenset[str] = frozenset()) -> Atoms:
@@ -183,7 +182,7 @@ def _frames(
     if not text.strip():
         raise structure_error(path, "holds no atoms: it is empty")
     recognised = (
-        form for form in BY_CONTENT if form.content and form.content.search(text[:BEGINNING])
+        form for form in all_formats() if form.content and form.content.search(text[:BEGINNING])
     )
     form = format_of(name) or next(recognised, None)
     if atom_types is not None and not (form and form.has_types):

@@ -1,7 +1,7 @@
 """Trajectories and topologies of runs, written to files of any format."""
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -11,7 +11,7 @@ import numpy as np
 from rigidmd.core.files import AppendedFile, write_text, writing
 from rigidmd.core.state import State
 from rigidmd.errors import SimulationError
-from rigidmd.formats import BY_EXTENSION, Topology, written
+from rigidmd.formats import BY_EXTENSION, Format, Topology, written
 from rigidmd.formats.atoms import Frame
 from rigidmd.formats.frame_file import FrameFile
 from rigidmd.scene.validation import not_none
@@ -19,9 +19,6 @@ from rigidmd.scene.validation import not_none
 if TYPE_CHECKING:
     from rigidmd.engines.sites import AnySystem
     from rigidmd.engines.system import System
-
-#: Formats of trajectories that hold any positions at any times.
-UNLIMITED = written(lambda form: form.encoder and form.limits == (-inf, inf) and not form.even)
 
 
 def open_trajectory(
@@ -43,8 +40,12 @@ def write_topology(path: Path, system: "AnySystem", state: State, *, wrapped: bo
     """Write names, molecules and first positions for viewers. Raises SimulationError if the format
     cannot hold one."""
     positions = system.site_positions(state, wrapped)
-    others = written(lambda form: form.topology and form.exceeded(positions) is None)
-    _check_fits(path, positions, "output.topology", others)
+    _check_fits(
+        path,
+        positions,
+        "output.topology",
+        lambda form: form.topology and form.exceeded(positions) is None,
+    )
     molecule = system.sites.molecule
     topology = Topology(
         system.sites.name.tolist(),
@@ -58,11 +59,19 @@ def write_topology(path: Path, system: "AnySystem", state: State, *, wrapped: bo
     write_text(path, not_none(BY_EXTENSION[path.suffix].topology)(topology))
 
 
-def _check_fits(path: Path, positions: np.ndarray, key: str, others: Sequence[str]) -> None:
-    """Raise SimulationError if the format of a file cannot hold positions (s, 3). `others` are
-    formats that can."""
+def _is_unlimited(form: Format) -> bool:
+    """Whether a format of trajectories holds any positions at any times."""
+    return bool(form.encoder) and form.limits == (-inf, inf) and not form.even
+
+
+def _check_fits(
+    path: Path, positions: np.ndarray, key: str, holds: Callable[[Format], object]
+) -> None:
+    """Raise SimulationError if the format of a file cannot hold positions (s, 3). `holds`: whether
+    another format can."""
     if (bound := BY_EXTENSION[path.suffix].exceeded(positions)) is not None:
         hint = "output.positions = 'wrapped', or for a body a smaller output.trajectory_A_per_m"
+        others = written(holds)
         hint = f"use {' or '.join(others)}, {hint}" if others else f"set {hint}"
         raise SimulationError(
             f"a position is beyond the {bound:g} Å that {path.suffix} ({key}) can hold: {hint}"
@@ -108,7 +117,7 @@ class TrajectoryFile(AppendedFile):
         positions = self._system.site_positions(state, self._wrapped)
         with np.errstate(over="ignore"):  # infinite positions are beyond every limit
             rounded = positions.astype(np.float32)
-        _check_fits(self._path, rounded, "output.trajectory", UNLIMITED)
+        _check_fits(self._path, rounded, "output.trajectory", _is_unlimited)
         velocities = self._system.site_velocities(state) if self._velocities else None
         cell = state.cell if np.isfinite(state.cell).all() else None
         with writing(self._path):  # memory for the file of a frame may be insufficient

@@ -437,8 +437,9 @@ def file_name(wanted: Callable[[Format], object]) -> AfterValidator:
             raise ValueError(
                 f"is {name!r}. Names beginning with input_ are reserved for copies of input files"
             )
-        if not name.endswith(extensions := written(wanted)):
-            raise ValueError(f"is {name!r}, must end in one of {' '.join(extensions)}")
+        form = format_of(name)
+        if form is None or not wanted(form) or not name.endswith(form.extensions[0]):
+            raise ValueError(f"is {name!r}, must end in one of {' '.join(written(wanted))}")
         return name
 
     return AfterValidator(check)

@@ -10,7 +10,7 @@ from pydantic import Field, PrivateAttr, Strict
 from rigidmd.core.plain_text import distinct
 from rigidmd.core.toml import Json
 from rigidmd.errors import SceneError, option
-from rigidmd.formats import BY_EXTENSION, TOPOLOGIES, TOPOLOGY, TRAJECTORY, format_of, written
+from rigidmd.formats import BY_EXTENSION, TOPOLOGY, TRAJECTORY, format_of, topologies, written
 from rigidmd.scene.base import Scene, file_name, is_inside
 from rigidmd.scene.engine import EngineChoice
 from rigidmd.scene.ensemble_methods import default_interval
@@ -315,7 +315,7 @@ class MolecularScene(CouplingKeys, MatterKeys):
             or form.read_arrays is None
         ):
             return start.topology
-        candidates = [str(Path(start.file).with_name(name)) for name in TOPOLOGIES]
+        candidates = [str(Path(start.file).with_name(name)) for name in topologies()]
         topology = next((name for name in candidates if self.path(name).is_file()), None)
         if topology is None:
             return None

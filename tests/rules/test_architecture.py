@@ -13,7 +13,7 @@ import pytest
 from support.common import ROOT
 
 from rigidmd.features import FEATURES
-from rigidmd.formats import BY_EXTENSION
+from rigidmd.formats import extensions
 
 PACKAGE = ROOT / "rigidmd"
 
@@ -318,7 +318,7 @@ NAMED_EXTENSIONS = {
 
 def test_only_a_format_names_its_extensions():
     """In texts except docstrings; `formats` also has the default names of files."""
-    extension = re.compile(rf"[.]({'|'.join(name[1:] for name in BY_EXTENSION)})\b")
+    extension = re.compile(rf"[.]({'|'.join(name[1:] for name in extensions(bool))})\b")
     naming = {}
     for path in FILES:
         tree = ast.parse(path.read_text(encoding="utf-8"))

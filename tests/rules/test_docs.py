@@ -48,7 +48,7 @@ from rigidmd.commands.arguments import read_scene
 from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
 from rigidmd.core.shipped import CHAPTERS, DOCS, GUIDES, SECTIONS, find_example
 from rigidmd.errors import SceneError
-from rigidmd.formats import BY_EXTENSION
+from rigidmd.formats import BY_EXTENSION, all_formats
 from rigidmd.run.kind import resolve
 from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override
 from rigidmd.scene.models import read_parameters
@@ -307,6 +307,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
 @pytest.fixture
 def own_formats():
     """Formats that a document registers are gone after its test."""
+    all_formats()
     before = dict(BY_EXTENSION)
     yield
     BY_EXTENSION.clear()

@@ -255,7 +255,7 @@ from rigidmd.scene import Scene, parse_override
             "[start]",
             '[structure]\nfile = "bad.toml"\natom_types = { 1 = "O" }\n[start]',
             [
-                "bad.toml: structure.atom_types is for formats whose atoms have types: data files of LAMMPS (.data), dumps of LAMMPS, .xyz .extxyz"
+                "bad.toml: structure.atom_types is for formats whose atoms have types: .gsd, .xyz .extxyz, data files of LAMMPS (.data), dumps of LAMMPS"
             ],
         ),
         (
