@@ -125,7 +125,7 @@ class _Figures:
         figure = new_figure(9, 4.9, title=self.title("path of the body axis"))
         left, right = figure.subplots(1, 2)
         sphere = View(left, camera(eye), 1.12)
-        sphere.ellipsoids([(np.ones(3), FAINT)])
+        sphere.ellipsoids(np.ones((1, 3)), [FAINT])
         sphere.curve(globe(), (0.45, 0.12), color=FAINT, lw=0.4)
         extremes = [circle(UP, polar.min()), circle(UP, polar.max())]
         for ring in extremes:
@@ -176,7 +176,7 @@ class _Figures:
         figure, axes = self.with_curves("omega", "ω in the body frame", len(boxes))
         for axis, (half, centre, title) in zip(axes, boxes, strict=True):
             picture = View(axis, view, half, centre)
-            picture.ellipsoids([(energy, COOL), (momentum, WARM)])
+            picture.ellipsoids(np.stack([energy, momentum]), [COOL, WARM])
             picture.path(omega, INK, depth)
             picture.triad(("ω₁", "ω₂", "ω₃"))
             axis.set_title(title, **NOTE)

@@ -1,6 +1,6 @@
 """Drawing of things in space, for all figures and animations: curves, spheres, faces, arrows."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -90,6 +90,16 @@ def path_style(flat: np.ndarray, half: ArrayLike) -> tuple[np.ndarray, float]:
     length = np.linalg.norm(np.diff(flat, axis=0) / half, axis=1).sum()
     shown = thin_path(flat / half, int(800 * length) + 2)
     return shown, max(0.25, 1.7 / (1 + length / 60))
+
+
+def glossy(color: np.ndarray, light: np.ndarray) -> np.ndarray:
+    """Colours (p, 3) of points of a surface by the light (p, 1) that they get, 0 to 1."""
+    return color * (0.45 + 0.55 * light) + 0.35 * light**12
+
+
+def pale(color: np.ndarray, light: np.ndarray) -> np.ndarray:
+    """The same for surfaces behind curves."""
+    return 1 - (0.38 - 0.28 * light) * (1 - color)
 
 
 class View:
@@ -199,42 +209,26 @@ class View:
             PolyCollection(flat, facecolors=tints, edgecolors=tints, lw=0.5, zorder=2)
         )
 
-    def ellipsoids(self, solids: Sequence[tuple[np.ndarray, str]]) -> None:
-        """Draw ellipsoids (semi-axes, colour) about the origin, which may intersect, in pale
-        colours."""
-        from matplotlib.colors import to_rgb
+    def ellipsoids(self, semi_axes: np.ndarray, colors: Sequence[str]) -> None:
+        """Draw ellipsoids (n,) about the origin, which may intersect, in pale colours, with their
+        rims."""
+        from matplotlib.colors import to_rgba_array
 
-        view, (right, up) = self.matrix, self.half
-        count = (500 * self.half / self.half.max()).astype(int)
-        x, y = (
-            np.linspace(middle - half, middle + half, n)
-            for middle, half, n in zip(self.centre, self.half, count, strict=True)
-        )
-        base = x[None, :, None] * view[0] + y[:, None, None] * view[1]
-        nearest = np.full(base.shape[:2], -np.inf)
-        image = np.zeros((*nearest.shape, 4))
-        for semi, color in solids:
-            inverse_squares = semi**-2.0
-            # The line of sight base + depth view[2] meets the surface where
-            # a depth² + 2 b depth + c = 0. The larger root is in front.
-            a = view[2] ** 2 @ inverse_squares
-            b = base @ (inverse_squares * view[2])
-            c = base**2 @ inverse_squares - 1
-            depth = (np.sqrt(np.maximum(b * b - a * c, 0)) - b) / a
-            normal = (base + depth[..., None] * view[2]) * inverse_squares
-            normal /= np.linalg.norm(normal, axis=-1, keepdims=True).clip(1e-300)
-            tint = 0.38 - 0.28 * np.clip(normal @ (LIGHT @ view), 0, 1)[..., None]
-            visible = (b * b >= a * c) & (depth > nearest + 1e-6 * max(right, up))
-            image[visible, :3] = (1 - tint * (1 - np.array(to_rgb(color))))[visible]
-            image[visible, 3] = 1.0
-            nearest[visible] = depth[visible]
-            rim = self.flat(semi * circle(view[2] / semi))
+        frames = np.broadcast_to(np.eye(3), (len(semi_axes), 3, 3))
+        tints = to_rgba_array(colors)[:, :3]
+        centres = np.zeros(semi_axes.shape)
+        self.image(self.solids(centres, frames, semi_axes, tints, pale), zorder=0.0)
+        for semi, color in zip(semi_axes, colors, strict=True):
+            rim = self.flat(semi * circle(self.matrix[2] / semi))
             draw_line(self.axis, rim, color=color, lw=0.8, alpha=0.6)
-        box = (x[0], x[-1], y[0], y[-1])
-        self.axis.imshow(image, origin="lower", extent=box, interpolation="bilinear", zorder=0)
 
     def solids(
-        self, centres: np.ndarray, rotation: np.ndarray, semi: np.ndarray, colors: np.ndarray
+        self,
+        centres: np.ndarray,
+        rotation: np.ndarray,
+        semi: np.ndarray,
+        colors: np.ndarray,
+        shade: Callable[[np.ndarray, np.ndarray], np.ndarray] = glossy,
     ) -> np.ndarray:
         """A picture (rows, columns, 4) for `image` of lit ellipsoids (n,), which may intersect:
         centres (n, 3), rotation (n, 3, 3) from their axes, semi-axes (n, 3), colors (n, 3)."""
@@ -264,20 +258,19 @@ class View:
             root = b * b - weight[2, 2] * c
             z = (np.sqrt(root.clip(0)) - b) / weight[2, 2]
             part = (slice(first[1], last[1]), slice(first[0], last[0]))
-            visible = (root >= 0) & (middle[2] + z > nearest[part])
+            visible = (root >= 0) & (middle[2] + z > nearest[part] + 1e-6 * self.half.max())
             normal = np.concatenate([flat, z[..., None]], axis=-1)[visible] @ weight
             normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-            bright = 0.45 + 0.55 * (normal @ light).clip(0)[:, None]
-            shine = 0.35 * (normal @ light).clip(0)[:, None] ** 12
-            image[part][visible] = np.insert((color * bright + shine).clip(0, 1), 3, 1.0, axis=1)
+            tint = shade(color, (normal @ light).clip(0)[:, None])
+            image[part][visible] = np.insert(tint.clip(0, 1), 3, 1.0, axis=1)
             nearest[part][visible] = (middle[2] + z)[visible]
         return image
 
-    def image(self, image: np.ndarray) -> None:
+    def image(self, image: np.ndarray, zorder: float = 2.0) -> None:
         """Draw a picture that fills the axes."""
         (left, bottom), (right, top) = self.centre - self.half, self.centre + self.half
         box = (left, right, bottom, top)
-        self.axis.imshow(image, origin="lower", extent=box, interpolation="bilinear", zorder=2)
+        self.axis.imshow(image, origin="lower", extent=box, interpolation="bilinear", zorder=zorder)
 
     def arrow(
         self,
