@@ -1,5 +1,6 @@
 """GRO, of GROMACS. ASE reads neither more digits, nor several frames, nor velocities of some atoms
-only."""
+only. MDAnalysis reads the first frame alone, in single precision, and refuses atoms without
+names."""
 
 import re
 from collections.abc import Callable
@@ -39,16 +40,23 @@ def read_gro(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
             raise structure_error(
                 path, f"line {first + 2} promises {count} atoms and a box, {reason}"
             )
-        what = "the box, 3 or 9 numbers (is the number of atoms right?)"
-        edges = numbers(path, box + 1, joined_numbers(lines[box]), what)
-        if len(edges) not in (3, 9):
-            raise unexpected(path, box + 1, what, lines[box].strip())
-        frames.append(partial(_gro_frame, path, lines, first, box, edges))
+        cell = cell_of_line(path, box + 1, lines[box], " (is the number of atoms right?)")
+        frames.append(partial(_gro_frame, path, lines, first, box, cell))
         first = box + 1
     return frames
 
 
-def _gro_frame(path: Path, lines: list[str], first: int, box: int, edges: list[float]) -> Atoms:
+def cell_of_line(path: Path, line: int, text: str, hint: str = "") -> np.ndarray:
+    """The cell (3, 3), Å, of three or nine numbers in nm. Raises StructureError."""
+    what = f"the box, 3 or 9 numbers{hint}"
+    edges = numbers(path, line, joined_numbers(text), what)
+    if len(edges) not in (3, 9):
+        raise unexpected(path, line, what, text.strip())
+    xx, yy, zz, xy, xz, yx, yz, zx, zy = [*edges, *[0.0] * (9 - len(edges))]
+    return 10 * np.array([[xx, xy, xz], [yx, yy, yz], [zx, zy, zz]])
+
+
+def _gro_frame(path: Path, lines: list[str], first: int, box: int, cell: np.ndarray) -> Atoms:
     """The frame in lines `first` to `box`. Column width is the distance between decimal points, as
     in GROMACS."""
     names, residue = [], []
@@ -84,8 +92,6 @@ def _gro_frame(path: Path, lines: list[str], first: int, box: int, edges: list[f
             velocity[k - first - 2] = components
         names.append(line[10:15].strip())
         residue.append((parse_whole_number(line[:5].strip()), line[5:10].strip()))
-    xx, yy, zz, xy, xz, yx, yz, zx, zy = [*edges, *[0.0] * (9 - len(edges))]
-    cell = 10 * np.array([[xx, xy, xz], [yx, yy, yz], [zx, zy, zz]])
     moving = None if np.isnan(velocity).all() else 10 * velocity
     rounding = 10 * 10.0 ** -(width - points[0] - 1) if points else 0.0
     return Atoms(names, [""] * len(names), residue, 10 * position, moving, cell, rounding=rounding)

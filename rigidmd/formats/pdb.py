@@ -1,4 +1,6 @@
-"""PDB. ASE reads neither numbers wider than their columns nor a CRYST1 that stands for no cell."""
+"""PDB. Neither ASE, gemmi nor MDAnalysis reads numbers wider than their columns: gemmi takes other
+numbers for them without a message. ASE refuses names that start with no element and a CRYST1 that
+stands for no cell."""
 
 import contextlib
 import re

@@ -1,4 +1,6 @@
-"""XYZ, plain and extended. ASE reads it, with corrections before and after."""
+"""XYZ, plain and extended. ASE reads it, with corrections before and after: it refuses names that
+are not elements, atomic numbers in plain files, Fortran's exponents and empty lines. MDAnalysis
+reads no box."""
 
 import io
 import re

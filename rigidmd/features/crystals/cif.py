@@ -1,5 +1,9 @@
-"""CIF of crystals and mmCIF of molecules. gemmi reads the syntax. The module `crystal` applies the
-symmetry."""
+"""CIF of crystals and mmCIF of molecules. gemmi reads the syntax, and has the space groups.
+
+In its structures atoms that are listed with their images count twice, atoms near special positions
+stay there, and a contradiction or another possible setting has no message. ASE refuses many symbols
+of space groups, and types that are not elements. So the module `crystal` applies the symmetry.
+"""
 
 import re
 from collections import Counter

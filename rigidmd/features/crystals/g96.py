@@ -1,4 +1,5 @@
-"""G96, of GROMACS and GROMOS. ASE takes NA for N, and reads neither velocities nor frames."""
+"""G96, of GROMACS and GROMOS. ASE takes NA for N, refuses massless sites, and reads neither
+velocities, residues nor frames. MDAnalysis does not know it."""
 
 import re
 from collections.abc import Callable
@@ -10,6 +11,7 @@ import numpy as np
 from rigidmd.core.toml import parse_whole_number
 from rigidmd.formats import Format, register
 from rigidmd.formats.atoms import Atoms, joined_numbers, numbers, structure_error, unexpected
+from rigidmd.formats.gro import cell_of_line
 
 #: Columns before the coordinates: number and name of the residue, name and number of the atom.
 HEAD = 24
@@ -67,13 +69,14 @@ def _frame(path: Path, frame: dict[str, Lines], first: dict[str, Lines], notes: 
             raise unexpected(path, number, "residue number, residue name, atom name", line.strip())
         names.append(words[2])
         residue.append((parse_whole_number(words[0]), words[1]))
+    box = frame.get("BOX")
     return Atoms(
         names,
         [""] * len(names),
         residue,
         position,
         velocity if len(velocity) else None,
-        _box(path, frame),
+        cell_of_line(path, box[0][0], " ".join(line for _, line in box)) if box else None,
         notes=notes,
     )
 
@@ -91,21 +94,6 @@ def _vectors(path: Path, frame: dict[str, Lines], blocks: tuple[str, ...]) -> np
             )
         rows.append(numbers(path, number, words, f"three numbers of {name}"))
     return 10 * np.array(rows).reshape(-1, 3)
-
-
-def _box(path: Path, frame: dict[str, Lines]) -> np.ndarray | None:
-    """The cell (3, 3) of a block BOX, three edges or nine numbers, in Å."""
-    content = frame.get("BOX", [])
-    words = [word for _, line in content for word in joined_numbers(line)]
-    if not words:
-        return None
-    line = content[0][0]
-    what = "the box, 3 or 9 numbers"
-    edges = numbers(path, line, words, what)
-    if len(edges) not in (3, 9):
-        raise unexpected(path, line, what, " ".join(words))
-    xx, yy, zz, xy, xz, yx, yz, zx, zy = [*edges, *[0.0] * (9 - len(edges))]
-    return 10 * np.array([[xx, xy, xz], [yx, yy, yz], [zx, zy, zz]])
 
 
 register(

@@ -4,7 +4,9 @@ A molecule of several sites is a rigid body as in HOOMD: a central particle with
 inertia, orientation and angular momentum, and its sites as constituent particles. A molecule of one
 site is a free particle. In a file the box is centred at the origin and particles are wrapped, with
 their image numbers. Here the box starts at the origin and positions are unwrapped. Files are read
-chunk by chunk, and sizes are checked before arrays are allocated.
+chunk by chunk by `gsd.fl`, and sizes are checked before arrays are allocated: `gsd.hoomd` allocates
+what a damaged file states, and has defaults for what a file lacks. MDAnalysis reads neither
+orientations nor angular momenta.
 """
 
 import contextlib

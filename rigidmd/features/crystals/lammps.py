@@ -1,5 +1,10 @@
 """Readers of LAMMPS' data files and text dumps. Atoms have types, which get names from labels,
-masses or the scene."""
+masses or the scene.
+
+MDAnalysis drops units, image numbers, names of types and boxes by three edges of data files, and
+elements and labels of dumps. ASE refuses data files of unnamed, hybrid and sphere styles, and dumps
+with labels or with elements in capitals.
+"""
 
 import re
 from collections.abc import Callable, Iterable
