@@ -30,6 +30,7 @@ LINEAR = 0.01
 WIDE = 0.4
 MOST_STARTS = 4000  # orientations from which orders are searched
 MOST_REFINEMENTS = 10
+FARTHEST = 1e6  # Å, more than any distance within a molecule
 MOST_DISTANCES = 1_000_000  # computed at once
 
 
@@ -249,8 +250,7 @@ class Orders:
 
         def sorted_distances(points: np.ndarray) -> np.ndarray:
             distance = np.linalg.norm(points[:, i] - points[:, j], axis=2)
-            order = np.lexsort((distance, np.broadcast_to(pair, distance.shape)), axis=1)
-            return np.take_along_axis(distance, order, 1)
+            return np.sort(FARTHEST * pair + distance, axis=1)
 
         template_distances = sorted_distances(self._template[None])
         blocks = np.array_split(points, 1 + len(points) * len(i) // MOST_DISTANCES)

@@ -16,8 +16,8 @@ from rigidmd.errors import OutputError
 from rigidmd.features.view.figures.space import View, camera
 from rigidmd.features.view.molecule_figure import color_of
 from rigidmd.features.view.page import Animation, PagePart, read_asset
-from rigidmd.features.view.solids import DEFAULT_RADIUS, SPHERE_SCALE, solids_of
-from rigidmd.formats.bonds import COVALENT, connections
+from rigidmd.features.view.solids import solids_of, sphere_radius
+from rigidmd.formats.bonds import connections
 from rigidmd.io.trajectory import Frames, read_frames
 from rigidmd.run.record import Record
 from rigidmd.run.results import Results
@@ -122,8 +122,8 @@ class MoleculeAnimation(Animation):
         frames = self._frames = frames or frames_of(record, most_frames)
         self.time, self.notes = frames.time, describe_thinning(frames)
         self._elements = [str(element) for element in sites.element[self._shown]]
-        radii = [SPHERE_SCALE * COVALENT.get(e, 0.0) or DEFAULT_RADIUS for e in self._elements]
-        self._radius, self._view = np.array(radii), camera(EYE)
+        self._radius = np.array([sphere_radius(element) for element in self._elements])
+        self._view = camera(EYE)
         self._colors = np.array([color_of(element) for element in self._elements])
         self._solids, self._fit = solids_of(record.system), RigidFit(record.system)
         self._kept: tuple[int, np.ndarray] | None = None  # a frame, and its picture
@@ -134,13 +134,6 @@ class MoleculeAnimation(Animation):
         self._low, self._high = seen.min(0), seen.max(0)
         reach = 1.0 if self._solids is None else self._solids.semi_axes.max()
         self._half = 0.54 * (self._high - self._low)[:2].max() + reach  # the picture is square
-
-    def loop_end(self) -> tuple[float, list[str]]:
-        """End of an animation, and notes."""
-        return float(self.time[-1]), []
-
-    def film_notes(self, interval: float, seconds: float) -> list[str]:
-        return []
 
     def draw(self, axes: "Axes", time: float) -> None:
         """Draw the last frame up to a time into axes, which are cleared."""

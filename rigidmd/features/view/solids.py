@@ -37,6 +37,11 @@ class Solids(NamedTuple):
         return np.where(np.isnan(self.color), of_direction, self.color)
 
 
+def sphere_radius(element: str) -> float:
+    """The radius, Å, of the sphere of an element."""
+    return SPHERE_SCALE * COVALENT.get(element, 0.0) or DEFAULT_RADIUS
+
+
 def solids_of(system: System) -> Solids | None:
     """The solids of a system, and its other sites with mass as spheres; None if no potential has a
     shape."""
@@ -53,7 +58,6 @@ def solids_of(system: System) -> Solids | None:
         species = system.species[system.model.species[sites.molecule[s]]]
         if species.name not in drawn:
             element = str(sites.element[s])
-            radius = SPHERE_SCALE * COVALENT.get(element, 0.0) or DEFAULT_RADIUS
             place = (sites.molecule[s], sites.offset_body[s], np.eye(3))
-            rows.append((*place, [radius] * 3, color_of(element)))
+            rows.append((*place, [sphere_radius(element)] * 3, color_of(element)))
     return Solids(*(np.array(column) for column in zip(*rows, strict=True)))
