@@ -1,10 +1,10 @@
 """Assigns the atoms of molecules to the sites of a rigid template, in the order that fits best.
 
-Names that are those of the sites fix the order, as in most .gro and .pdb files. An order is
-searched for files that have elements only (.xyz, .cif, .gen, POSCAR), for names that several atoms
-share, and for molecules that symmetry or bonding distances put together, whose atoms are in another
-order in each. Massless sites that lack a symmetry of the atoms are not distinguished: the order of
-the file decides, without a note.
+Unique names of sites fix the order, as in most .gro and .pdb files. An order is searched for files
+that have elements only (.xyz, .cif, .gen, POSCAR), for names that several atoms share, and for
+molecules that symmetry or bonding distances put together, whose atoms are in another order in each.
+Massless sites that lack a symmetry of the atoms are not distinguished: the order of the file
+decides, without a note.
 """
 
 from collections.abc import Hashable, Iterable
