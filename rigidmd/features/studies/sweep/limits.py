@@ -243,9 +243,10 @@ class _Series:
     not_joint: dict[str, None] = field(default_factory=dict)
 
     def of_method(self, column: str) -> Json:
-        """The values of keys on which a column does not depend at a step of 0: averages of the log
-        are the same for all methods."""
-        keys = [key for key in self.values if key.endswith(OF_METHODS) and column in OF_LOG]
+        """The values of keys on which a column does not depend at a step of 0: with a thermostat,
+        averages of the log are the same for all methods."""
+        is_same = self.stage.has_thermostat and column in OF_LOG
+        keys = [key for key in self.values if key.endswith(OF_METHODS) and is_same]
         return {key: self.values[key] for key in keys}
 
     def ensemble(self, column: str) -> str:
@@ -272,7 +273,7 @@ class _Series:
 def extrapolate_sweep(manifest: Manifest, key: str) -> Limits:
     """Extrapolate all log averages in a sweep, and the values of its analyses, to a step of 0.
 
-    Averages of the log by several integrators and thermostats have one limit. Values of analyses
+    With a thermostat, averages of the log by several methods have one limit. Values of analyses
     come from replicas together, if they have been analysed together, else from single runs. Raises
     SceneError if the key is not a swept time step, OutputError.
     """

@@ -131,6 +131,22 @@ def test_the_order_of_an_extrapolation_is_that_of_the_integrator(argon, tmp_path
     assert limit.fit == extrapolate(limit.points) != extrapolate(of_order_2)
 
 
+@pytest.mark.parametrize(("ensemble", "slopes"), [("nve", 1), ("nvt", 2)])
+def test_methods_have_one_limit_with_a_thermostat(ensemble, slopes, argon, tmp_path):
+    """Each with its order. At constant energy runs by other methods have another energy."""
+    stage = {"ensemble": ensemble, "duration_ps": 2.0}
+    if ensemble == "nvt":
+        stage["temperature_K"] = 90.0
+    swept = {STEP: [5, 10], "stages.0.integrator": ["velocity_verlet", "srkn_4"]}
+    fixed = {f"stages.0.{key}": value for key, value in stage.items()}
+    fixed["output.log_interval_ps"] = 0.02
+    axes = sweeping.axes_of(swept | fixed)
+    found = limits.extrapolate_sweep(run_here(argon, axes, tmp_path / ensemble, step=STEP), STEP)
+    of_both = [limit for limit in found.limits if limit.quantity == "Temperature (K)"]
+    assert {limit.order: len(limit.fit.slopes) for limit in of_both} == {2: slopes, 4: slopes}
+    assert len({limit.fit.limit for limit in of_both}) == 3 - slopes
+
+
 def test_what_cannot_be_extrapolated(argon, finished, tmp_path, printed):
     (scene := tmp_path / "argon.toml").write_text(ARGON + "[[stages]]\nduration_ps = 1\n")
     steps = ["--set", "stages.0.timestep_fs=2,4"]
