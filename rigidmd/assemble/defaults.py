@@ -18,7 +18,7 @@ from rigidmd.assemble.plausibility import shortest_contact, switches_cores
 from rigidmd.core.integrators import WITH_THERMOSTAT
 from rigidmd.core.toml import Json
 from rigidmd.forces.neighbors.space import Triclinic, cell_of, longest_gaps
-from rigidmd.forces.parts import Composition, Grid, Settings
+from rigidmd.forces.parts import Grid, Settings, SystemParts
 from rigidmd.forces.potentials.truncation import default_switch_start
 from rigidmd.formats.cells import nearest_image_distance
 from rigidmd.scene import MolecularScene
@@ -68,26 +68,24 @@ class SceneWithDefaults(NamedTuple):
     pme_grid: Grid | None
 
 
-def with_defaults(scene: MolecularScene, composition: Composition) -> SceneWithDefaults:
+def with_defaults(scene: MolecularScene, parts: SystemParts) -> SceneWithDefaults:
     """A scene of molecules with all defaults except `with_momentum_removal` and
     `with_precision`."""
-    scene, errors = _with_electrostatics(scene, composition)
-    numbers, cutoff_errors = _cutoff_and_switch(scene, composition)
+    scene, errors = _with_electrostatics(scene, parts)
+    numbers, cutoff_errors = _cutoff_and_switch(scene, parts)
     errors += cutoff_errors
     settings = Settings({}, errors)
     of_method = getattr(electrostatics_module(scene.forces), "settings", None)
     if not errors and of_method is not None:
-        settings = of_method(
-            scene.forces, composition, numbers["cutoff_A"], scene.engine.is_external
-        )
+        settings = of_method(scene.forces, parts, numbers["cutoff_A"], scene.engine.is_external)
         errors = settings.errors
     if not errors and scene.forces.dispersion != "cutoff":
         from rigidmd.forces.ewald import dispersion  # for these scenes only
 
-        of_dispersion = dispersion.settings(scene.forces, composition, numbers["cutoff_A"])
+        of_dispersion = dispersion.settings(scene.forces, parts, numbers["cutoff_A"])
         numbers = numbers | of_dispersion.numbers
         errors = of_dispersion.errors
-    if scene.output.pressure_tensor_interval_ps and composition.space.volume == inf:
+    if scene.output.pressure_tensor_interval_ps and parts.space.volume == inf:
         why = "without which the pressure is not defined"
         errors.append(f"output.pressure_tensor_interval_ps needs a periodic box, {why}")
     output = scene.output
@@ -110,7 +108,7 @@ def with_defaults(scene: MolecularScene, composition: Composition) -> SceneWithD
             (
                 entry
                 if entry.file is None
-                else entry.model_copy(update={"name": composition.species[k].name})
+                else entry.model_copy(update={"name": parts.species[k].name})
             )
             for k, entry in enumerate(scene.molecules)
         ),
@@ -143,7 +141,7 @@ def with_momentum_removal(scene: MolecularScene, keeps_momentum: np.ndarray) -> 
 
 
 def _with_electrostatics(
-    scene: MolecularScene, composition: Composition
+    scene: MolecularScene, parts: SystemParts
 ) -> tuple[MolecularScene, list[str]]:
     """A scene with its method of electrostatics, tail correction and cutoff scheme of charges, and
     error messages."""
@@ -151,19 +149,19 @@ def _with_electrostatics(
     errors = []
     method = forces.electrostatics
     if method is None:
-        has_charges = any(m.charges.any() for m in composition.species)
-        method = (PERIODIC if composition.space.volume < inf else OPEN) if has_charges else "none"
+        has_charges = any(m.charges.any() for m in parts.species)
+        method = (PERIODIC if parts.space.volume < inf else OPEN) if has_charges else "none"
         errors += [f"forces.{message}" for message in forces.idle_key_errors(method)]
     numbers: Json = {"electrostatics": method}
     if method == "reaction_field" and forces.reaction_field_truncation is None:
         like = forces.truncation in ("plain", "smooth_switch")
         numbers["reaction_field_truncation"] = forces.truncation if like else "shift"
     if forces.tail_correction is None:
-        numbers["tail_correction"] = not without_tail_reason(scene, composition)
+        numbers["tail_correction"] = not without_tail_reason(scene, parts)
     return scene.model_copy(update={"forces": forces.model_copy(update=numbers)}), errors
 
 
-def without_tail_reason(scene: MolecularScene, composition: Composition) -> str:
+def without_tail_reason(scene: MolecularScene, parts: SystemParts) -> str:
     """Why a scene has no tail correction by default, or an empty text if it has a tail
     correction."""
     forces = scene.forces
@@ -179,15 +177,15 @@ def without_tail_reason(scene: MolecularScene, composition: Composition) -> str:
         return "it is for a uniform liquid, and there are walls"
     if any(m.frozen for m in scene.molecules):
         return "it is for a uniform liquid, and molecules are frozen"
-    if composition.space.volume == inf:
+    if parts.space.volume == inf:
         return "the scene has no periodic box"
-    if (forces.cutoff_A or CUTOFF) < shortest_contact(composition.species):
+    if (forces.cutoff_A or CUTOFF) < shortest_contact(parts.species):
         return "molecules touch beyond the cutoff"
-    if switches_cores(forces, shortest_contact(composition.species)):
+    if switches_cores(forces, shortest_contact(parts.species)):
         return "the switch begins where molecules overlap"
     # A slab or a droplet leaves a part of an edge without any centre of mass, longer than two
     # distances between neighbours.
-    space, position = composition.space, composition.position
+    space, position = parts.space, parts.state.position
     if longest_gaps(space, position).max() > 2 * (space.volume / len(position)) ** (1 / 3):
         return "the molecules do not fill the box evenly"
     return ""
@@ -200,9 +198,9 @@ def electrostatics_module(forces: Forces) -> ModuleType | None:
     return import_module(f"rigidmd.forces.{name}") if name else None
 
 
-def _larger_box(scene: MolecularScene, composition: Composition, cutoff: float) -> str:
+def _larger_box(scene: MolecularScene, parts: SystemParts, cutoff: float) -> str:
     """What has twice the cutoff between its faces, for a message."""
-    for entry, kind in zip(scene.molecules, composition.species, strict=False):
+    for entry, kind in zip(scene.molecules, parts.species, strict=False):
         if entry.repeat is not None and kind.cell is not None:
             unit = kind.cell / np.array(entry.repeat)[:, None]
             heights = 1 / np.linalg.norm(np.linalg.inv(unit), axis=0)
@@ -210,12 +208,12 @@ def _larger_box(scene: MolecularScene, composition: Composition, cutoff: float) 
     return "a larger box"
 
 
-def _cutoff_and_switch(scene: MolecularScene, composition: Composition) -> tuple[Json, list[str]]:
+def _cutoff_and_switch(scene: MolecularScene, parts: SystemParts) -> tuple[Json, list[str]]:
     """Cutoff and start of a switch as keys of [forces], and error messages."""
     from scipy.spatial.distance import pdist  # slow to import
 
     forces = scene.forces
-    space = composition.space
+    space = parts.space
     cutoff_A = forces.cutoff_A or (CUTOFF if space.volume < inf else None)
     cutoff = cutoff_A or inf
     start = forces.switch_start_A
@@ -227,7 +225,7 @@ def _cutoff_and_switch(scene: MolecularScene, composition: Composition) -> tuple
     for key, value in (("cutoff_A", cutoff), ("ewald_cutoff_A", forces.ewald_cutoff_A or 0.0)):
         if value > half:
             default = "" if getattr(forces, key) else " (the default)"
-            larger = _larger_box(scene, composition, value)
+            larger = _larger_box(scene, parts, value)
             shorter = f"{key} = {floor(100 * half) / 100:g} or less"
             why = "which violates the minimum-image convention"
             if value <= allowed:
@@ -239,7 +237,7 @@ def _cutoff_and_switch(scene: MolecularScene, composition: Composition) -> tuple
             errors.append(
                 f"forces.{key} = {value:g}{default} is longer than {limit}, {why}. {advice}"
             )
-    bodies = [m for m in composition.species if m.cell is None]  # a framework fills the box
+    bodies = [m for m in parts.species if m.cell is None]  # a framework fills the box
     extents = {m.name: pdist(m.positions_body).max(initial=0.0) for m in bodies}
     errors += [
         f"a molecule of {m} is {x:.2f} Å long, more than {limit}"

@@ -17,9 +17,8 @@ from rigidmd.core.state import state_of
 from rigidmd.dynamics.model import Model
 from rigidmd.errors import SceneError
 from rigidmd.features import acting_on
-from rigidmd.forces.neighbors.space import Orthorhombic, Space, cell_of, space_of
-from rigidmd.forces.parts import Composition, SystemParts
-from rigidmd.formats.cells import describe_basis, describe_cell
+from rigidmd.forces.neighbors.space import Orthorhombic, Space, space_of
+from rigidmd.forces.parts import SystemParts
 from rigidmd.mechanics.free_rotor import NoRotor, split_rotor
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import Molecule
@@ -53,29 +52,26 @@ def resolve(scene: MolecularScene) -> ResolvedScene:
     counts = np.bincount(index, minlength=len(species))
     if implausible := scene_errors(scene, species, counts, space):
         raise SceneError(scene.source, implausible)
-    cell = ""
-    if start.cell is not None:
-        cell = f"{describe_cell(cell_of(space))}, {describe_basis(start.basis)}"
-    composition = Composition(species, counts, space, start.basis, cell, start.position)
-    resolved = with_defaults(scene, composition)
+    state = state_of(
+        position=wrapped_between_walls(scene, space, start.position),
+        rotation=start.rotation if any(m.inertia.any() for m in species) else None,
+        cell=start.cell,
+    )
+    model = _model_of(species, index, frozen)
+    parts = SystemParts(scene, species, model, space, state, number, start.basis, None)
+    resolved = with_defaults(scene, parts)
     complete, errors = resolved.scene, [*errors, *resolved.errors]
     for feature in acting_on(complete):
         complete, more = feature.resolve(complete, species)
         errors += more
     if errors:
         raise SceneError(scene.source, errors)
-    model = _model_of(species, index, frozen)
-    state = state_of(
-        position=wrapped_between_walls(complete, space, start.position),
-        rotation=start.rotation if any(m.inertia.any() for m in species) else None,
-        cell=start.cell,
-    )
     return ResolvedScene(
-        SystemParts(complete, species, model, space, state, number, start.basis, resolved.pme_grid),
+        parts._replace(scene=complete, grid=resolved.pme_grid),
         model,
         start,
         temperature,
-        _without_tail(scene, complete, composition),
+        _without_tail(scene, complete, parts),
         notes,
         warnings,
     )
@@ -105,15 +101,13 @@ def _model_of(species: list[Molecule], index: np.ndarray, frozen: np.ndarray) ->
     )
 
 
-def _without_tail(
-    written: MolecularScene, complete: MolecularScene, composition: Composition
-) -> str:
+def _without_tail(written: MolecularScene, complete: MolecularScene, parts: SystemParts) -> str:
     """Why a scene has no tail correction. Empty with one, or with a sum of dispersion."""
     if complete.forces.dispersion != "cutoff" or complete.forces.tail_correction:
         return ""
     if written.forces.tail_correction is False:
         return "forces.tail_correction is false"
-    return without_tail_reason(written, composition)
+    return without_tail_reason(written, parts)
 
 
 def wrapped_between_walls(scene: MolecularScene, space: Space, position: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from rigidmd.errors import OutputError, visible
 
 
 def announce(message: str) -> None:
-    """Say on the standard error what begins."""
+    """Report on the standard error what begins."""
     print(f"  {message} ...", file=sys.stderr, flush=True)
 
 

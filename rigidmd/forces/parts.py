@@ -15,6 +15,7 @@ from rigidmd.forces.ewald.errors import FINE, Charges, charges_in, filled_fracti
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites, exclusion_groups, sites_of
 from rigidmd.forces.neighbors.space import Space
+from rigidmd.formats.cells import describe_basis, describe_cell
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.molecules import MolecularScene
 from rigidmd.units import COULOMB_CHARGE
@@ -76,6 +77,15 @@ class SystemParts(NamedTuple):
     def filled(self) -> float:
         """See `errors.filled_fraction`."""
         return filled_fraction(self.species, self.counts, self.space, self.state.position)
+
+    @property
+    def charges(self) -> Charges:
+        return charges_in(self.species, self.counts)
+
+    @property
+    def cell_text(self) -> str:
+        """The cell of the box in terms of the given cell, for messages."""
+        return f"{describe_cell(self.state.cell)}, {describe_basis(self.basis)}"
 
     def charged(self) -> tuple[BodySites | CentralSites, np.ndarray]:
         """The charged sites, and their charges (s,) in e."""
@@ -162,26 +172,6 @@ class Interactions(NamedTuple):
         None  # estimated rms error of the Coulomb force on a site, u Å/ps²; with Ewald sums
     )
     notes: tuple[str, ...] = ()
-
-
-class Composition(NamedTuple):
-    """The properties of a system, in addition to its scene, on which defaults depend."""
-
-    species: Sequence[Molecule]
-    counts: np.ndarray  # (k,) molecules of each species
-    space: Space
-    basis: np.ndarray  # see `SystemParts`
-    cell: str  # the cell of the box in terms of the given cell, for messages
-    position: np.ndarray  # (n, 3) centres of mass at the start
-
-    @property
-    def charges(self) -> Charges:
-        return charges_in(self.species, self.counts)
-
-    @property
-    def filled(self) -> float:
-        """See `errors.filled_fraction`."""
-        return filled_fraction(self.species, self.counts, self.space, self.position)
 
 
 class Settings(NamedTuple):

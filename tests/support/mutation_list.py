@@ -407,7 +407,7 @@ RINGS = [
         "D3",
         "dispersion by Ewald sums: each of two parts may have the whole error that is asked for",
         "forces/ewald/dispersion.py",
-        "    part = _error(accuracy, species, counts) * sqrt(composition.filled / 2)",
+        "    part = _error(accuracy, species, counts) * sqrt(parts.filled / 2)",
         "    part = _error(accuracy, species, counts) * 2",
         ("forces/ewald/test_dispersion.py::test_forces_are_as_accurate_as_requested",),
     ),

@@ -23,7 +23,6 @@ from rigidmd.forces.ewald.errors import (
 from rigidmd.forces.ewald.smooth import InverseR6
 from rigidmd.forces.neighbors.space import cell_of
 from rigidmd.forces.parts import (
-    Composition,
     Interactions,
     KeysAndValues,
     Settings,
@@ -45,9 +44,9 @@ def dispersing_in(species: Sequence[Molecule], counts: np.ndarray) -> Dispersing
     return charges_in(species, counts, lambda m: m.dispersion, Dispersing)
 
 
-def settings(forces: Forces, composition: Composition, cutoff: float | None) -> Settings:
+def settings(forces: Forces, parts: SystemParts, cutoff: float | None) -> Settings:
     """The keys of [forces] that follow from the accuracy. cutoff : of Lennard-Jones, Å"""
-    space, species, counts = composition.space, composition.species, composition.counts
+    space, species, counts = parts.space, parts.species, parts.counts
     where = f"forces.dispersion = {forces.dispersion!r}"
     sites = dispersing_in(species, counts)
     if space.volume == inf or cutoff is None:
@@ -57,7 +56,7 @@ def settings(forces: Forces, composition: Composition, cutoff: float | None) -> 
     accuracy = forces.dispersion_accuracy or ACCURACY
     cell = cell_of(space)
     # of the real-space and of the reciprocal error
-    part = _error(accuracy, species, counts) * sqrt(composition.filled / 2)
+    part = _error(accuracy, species, counts) * sqrt(parts.filled / 2)
     beta = float(forces.dispersion_beta_per_A or alpha_for(sites, cutoff, space.volume, part))
     numbers: KeysAndValues = {"dispersion_accuracy": accuracy, "dispersion_beta_per_A": beta}
     unreachable = (
@@ -76,9 +75,9 @@ def settings(forces: Forces, composition: Composition, cutoff: float | None) -> 
             )
         return Settings(numbers, [])
     grid, order = forces.dispersion_grid, forces.dispersion_order
-    is_given_cell = np.array_equal(composition.basis, direct_sum.SAME_BASIS)
+    is_given_cell = np.array_equal(parts.basis, direct_sum.SAME_BASIS)
     if grid is not None and len(set(grid)) > 1 and not is_given_cell:
-        error = f"the box is the equivalent cell with {composition.cell}: give three equal numbers"
+        error = f"the box is the equivalent cell with {parts.cell_text}: give three equal numbers"
         return Settings(
             numbers,
             [f"forces.dispersion_grid = {list(grid)} refers to a cell with a large tilt; {error}"],

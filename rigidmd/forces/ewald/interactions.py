@@ -23,7 +23,7 @@ from rigidmd.forces.ewald.errors import (
 from rigidmd.forces.ewald.smooth import InverseR
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
 from rigidmd.forces.neighbors.space import Space, cell_of
-from rigidmd.forces.parts import Composition, Interactions, KeysAndValues, Settings, SystemParts
+from rigidmd.forces.parts import Interactions, KeysAndValues, Settings, SystemParts
 from rigidmd.forces.potentials.screened_coulomb import screened_coulomb, screening_errors
 from rigidmd.scene.forces import Forces
 from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
@@ -57,9 +57,7 @@ def setting_errors(forces: Forces, space: Space, cutoff: float) -> list[str]:
     return screening_errors("ewald_alpha_per_A", forces.ewald_alpha_per_A, cutoff)
 
 
-def settings(
-    forces: Forces, composition: Composition, cutoff: float, is_external: bool
-) -> Settings:
+def settings(forces: Forces, parts: SystemParts, cutoff: float, is_external: bool) -> Settings:
     """The keys of [forces] that follow from the accuracy. ewald_accuracy becomes None when all of
     them are set.
 
@@ -67,46 +65,42 @@ def settings(
     """
     usual = "plain" if forces.truncation == "plain" or is_external else "shift"
     numbers: KeysAndValues = {"ewald_truncation": forces.ewald_truncation or usual}
-    charges = composition.charges
-    cell = cell_of(composition.space)
+    charges = parts.charges
+    cell = cell_of(parts.space)
     if charges.count == 0:
         return Settings(numbers, [])
     accuracy = forces.ewald_accuracy or ACCURACY
-    filled = composition.filled
+    filled = parts.filled
     # of the real-space and of the reciprocal error, at the mean density
     part = accuracy * sqrt(filled / 2)
     free = (forces.ewald_cutoff_A, forces.ewald_alpha_per_A, forces.pme_order, forces.pme_grid) == (
         None,
     ) * 4
     if forces.electrostatics == "pme" and free and not is_external:
-        longest = min(
-            LONGEST_CUTOFF * filled ** (-1 / 3), SHRINKAGE * min(composition.space.edges) / 2
-        )
+        longest = min(LONGEST_CUTOFF * filled ** (-1 / 3), SHRINKAGE * min(parts.space.edges) / 2)
         cutoff = fastest_cutoff(charges, cell, longest, part, filled) or cutoff
     cutoff = numbers["ewald_cutoff_A"] = forces.ewald_cutoff_A or cutoff
     unreachable = (
         f"forces.ewald_accuracy = {accuracy:g}{_default(forces.ewald_accuracy)} cannot be reached"
     )
-    alpha = float(
-        forces.ewald_alpha_per_A or alpha_for(charges, cutoff, composition.space.volume, part)
-    )
+    alpha = float(forces.ewald_alpha_per_A or alpha_for(charges, cutoff, parts.space.volume, part))
     if alpha * cutoff > MAX_ALPHA_CUTOFF:
         return Settings(numbers, [f"{unreachable} with a cutoff of {cutoff:g} Å. Use a longer one"])
     numbers |= {"ewald_alpha_per_A": alpha, "ewald_accuracy": None}
     if forces.electrostatics == "ewald":
-        return _settings_of_vectors(forces, composition, alpha, part, numbers)
-    return _settings_of_grid(forces, composition, alpha, part, numbers, accuracy, unreachable)
+        return _settings_of_vectors(forces, parts, alpha, part, numbers)
+    return _settings_of_grid(forces, parts, alpha, part, numbers, accuracy, unreachable)
 
 
 def _settings_of_vectors(
-    forces: Forces, composition: Composition, alpha: float, part: float, numbers: KeysAndValues
+    forces: Forces, parts: SystemParts, alpha: float, part: float, numbers: KeysAndValues
 ) -> Settings:
     """The radius of the k-vectors of a plain Ewald sum for an error `part`."""
-    cell = cell_of(composition.space)
+    cell = cell_of(parts.space)
     radius = forces.ewald_k_radius_per_A
     if not forces.sets_k_vectors:
         inverse = 2 * pi * np.linalg.inv(cell).T
-        radius = float(k_cutoff_for(composition.charges, alpha, inverse, part))
+        radius = float(k_cutoff_for(parts.charges, alpha, inverse, part))
     longest = np.linalg.norm(cell, axis=1).max()
     if (
         radius is not None
@@ -118,7 +112,7 @@ def _settings_of_vectors(
             f" more than {MOST_K_VECTORS} k-vectors along an edge of the box"
         )
         return Settings(numbers, [error])
-    count = _number_of_k_vectors(forces, radius, composition.space.volume)
+    count = _number_of_k_vectors(forces, radius, parts.space.volume)
     if count > MOST_K_VECTORS_IN_ALL:
         error = f"needs about {count:.2g} k-vectors, more than {MOST_K_VECTORS_IN_ALL:.2g}"
         advice = "use pme, a lower accuracy, fewer k-vectors or a smaller box"
@@ -128,7 +122,7 @@ def _settings_of_vectors(
 
 def _settings_of_grid(
     forces: Forces,
-    composition: Composition,
+    parts: SystemParts,
     alpha: float,
     part: float,
     numbers: KeysAndValues,
@@ -139,19 +133,19 @@ def _settings_of_grid(
 
     unreachable : the beginning of the sentence if there are none
     """
-    cell = cell_of(composition.space)
+    cell = cell_of(parts.space)
     grid, order = forces.pme_grid, forces.pme_order
-    has_given_cell = np.array_equal(composition.basis, direct_sum.SAME_BASIS)
+    has_given_cell = np.array_equal(parts.basis, direct_sum.SAME_BASIS)
     if grid is not None and len(set(grid)) > 1 and not has_given_cell:
         error = (
             f"forces.pme_grid = {list(grid)} refers to the edges of a cell with a large tilt. The"
-            f" box is the equivalent cell with {composition.cell}. Give this cell as the box, or"
+            f" box is the equivalent cell with {parts.cell_text}. Give this cell as the box, or"
             " three equal numbers, or leave pme_grid out"
         )
         return Settings(numbers, [error])
     if grid is None or order is None:
         longest = np.linalg.norm(cell, axis=1).max()
-        grid_and_order = pme_grid_for(composition.charges, alpha, cell, part, order, grid)
+        grid_and_order = pme_grid_for(parts.charges, alpha, cell, part, order, grid)
         if grid_and_order is None and longest > MAX_GRID_POINTS * COARSE_SPACING:
             error = f"an edge of {longest:.4g} Å is too long for a grid of {MAX_GRID_POINTS} points"
             return Settings(numbers, [f"forces.electrostatics = 'pme': {error}"])
