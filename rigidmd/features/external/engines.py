@@ -23,7 +23,6 @@ from rigidmd.errors import SceneError
 from rigidmd.features.external.force_field import (
     ForceFieldView,
     force_field_of,
-    tail_of_formulas,
     unknown_terms,
 )
 from rigidmd.features.potentials.poses.potential import BodyPairPotential
@@ -212,8 +211,7 @@ def supporting_program(system: System) -> Program:
 #: Tolerance of pair sums, relative to their size: engines have slightly different constants, such
 #: as 332.06371. Energies of OpenMM in single precision differ by up to 3e-7.
 PLAIN = 1e-6
-#: Component of an observation that engines take from the system, so that it is compared with
-#: another value.
+#: Component of an observation that engines take from the system, so that it is not compared.
 TAIL = "lennard_jones_tail"
 #: Ratio of virial and energy of a 1/r¹² term. The energy may be smaller, where attraction cancels
 #: repulsion.
@@ -240,15 +238,8 @@ class Comparison(NamedTuple):
 
 def compare_at(system: System, state: State, engine: Engine, other: Engine) -> list[Comparison]:
     """Compare energies by term, forces and torques on bodies, and the virial of two engines at a
-    state. The tail correction is compared with `tail_of_formulas`."""
+    state."""
     ours, theirs = (observe(system, engine, state, energy_unit=1.0) for engine in (engine, other))
-    independent = {}  # instead of what both observations take from the system
-    if TAIL in theirs.components:
-        independent[TAIL] = tail_of_formulas(force_field_of(system), state.volume)
-    potential = theirs.potential + sum(
-        value - theirs.components[name] for name, value in independent.items()
-    )
-    their_components = theirs.components | independent
     virial = sum(abs(float(tally.virial.trace())) for tally in engine.evaluate(state)[1].values())
 
     kinetic = sum(kinetic_energies(system, state))
@@ -265,11 +256,15 @@ def compare_at(system: System, state: State, engine: Engine, other: Engine) -> l
         force_error * (1 / alpha if alpha else 0.0) * (PER_SITE * sites + ERRORS * np.sqrt(sites))
     )
     lines = []
-    for name in {**ours.components, **their_components}:
-        a, b = (components.get(name, 0.0) for components in (ours.components, their_components))
+    for name in {**ours.components, **theirs.components}:
+        if name == TAIL:
+            continue
+        a, b = (observation.components.get(name, 0.0) for observation in (ours, theirs))
         tolerance = PLAIN * size + (ewald if name.startswith("coulomb") else 0.0)
         lines.append(_energy(name.replace("_", " "), a, b, tolerance))
-    lines.append(_energy("potential energy", ours.potential, potential, PLAIN * size + ewald))
+    lines.append(
+        _energy("potential energy", ours.potential, theirs.potential, PLAIN * size + ewald)
+    )
     each = np.sqrt(sites / len(system.model.species)) * ERRORS * force_error
     radius = max(m.radius for m in system.species)
     for name, unit, k, tolerance in (

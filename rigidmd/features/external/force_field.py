@@ -7,14 +7,13 @@ truncation are decided once. `unknown_terms` lists what no other program can exp
 """
 
 from collections.abc import Callable, Iterator, Mapping
-from itertools import combinations_with_replacement, pairwise, product
+from itertools import product
 from math import inf
 from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from rigidmd.engines.system import System
-from rigidmd.features.potentials.expressions.radial import Radial
 from rigidmd.features.potentials.expressions.slopes import function_of, slopes_of
 from rigidmd.features.potentials.expressions.trace import Graph, Traced
 from rigidmd.features.potentials.extra import body_pairs_of
@@ -31,11 +30,9 @@ from rigidmd.forces.potentials.truncation import (
     SmoothlySwitched,
     Switched,
     Truncation,
-    Unmodified,
 )
 from rigidmd.forces.terms import trait
 from rigidmd.scene import MolecularScene
-from rigidmd.scene.validation import not_none
 
 #: Classes of the pair potentials and terms that the view describes.
 DESCRIBED = (
@@ -52,8 +49,6 @@ SWITCHES: dict[type, str] = {
     Switched: "1-10*t^3+15*t^4-6*t^5",
     SmoothlySwitched: "1-126*t^5+420*t^6-540*t^7+315*t^8-70*t^9",
 }
-#: In place of the distance 0 (Å) of a site from itself in formulas, which have 1/r there.
-CONTACT = 1e-9
 
 
 class SiteKind(NamedTuple):
@@ -282,72 +277,3 @@ def _traced(formula: str, r: Traced) -> Traced:
         name, _, value = definition.partition("=")
         names[name] = eval(value, names)
     return eval(text, names)
-
-
-def tail_of_formulas(view: ForceFieldView, volume: float) -> float:
-    """The energy of the tail correction, u Å²/ps², by quadrature of the formulas that other
-    programs evaluate.
-
-    It has no code in common with `lennard_jones.tail`, with which it is compared: programs have no
-    correction for most cutoff schemes, or one that counts sites of one molecule differently.
-    """
-    count = np.bincount(view.kind, minlength=len(view.kinds))
-    total = 0.0
-    for i, j in combinations_with_replacement(range(len(view.kinds)), 2):
-        if view.epsilon[i, j] == 0:
-            continue
-        integral, removed = _removed_by_truncation(
-            view, float(view.sigma[i, j]), float(view.epsilon[i, j])
-        )
-        orders = 1 if i == j else 2
-        total += orders * 2 * np.pi / volume * float(count[i] * count[j]) * integral
-        # sites of one molecule are not neighbours of each other
-        total -= orders / 2 * sum(removed(r) * n for r, n in _distances_in_molecules(view, i, j))
-    return total
-
-
-def _removed_by_truncation(
-    view: ForceFieldView, sigma: float, epsilon: float
-) -> tuple[float, Callable[[float], float]]:
-    """The integral of r² (v - truncated v) over all r, and v - truncated v as a function of r."""
-    from scipy.integrate import quad  # slow to import
-
-    potential = not_none(view.lennard_jones)
-    powers = 4 * epsilon * sigma**12, 4 * epsilon * sigma**6
-    nothing = (0.0,) * 4
-    unmodified = potential._replace(truncation=Unmodified(inf), terms12=nothing, terms6=nothing)
-    r = Graph().leaf("r")
-    energy = _traced(lennard_jones_formula(unmodified, *powers, 1.0), r)
-    inside = energy - _traced(lennard_jones_formula(potential, *powers, 1.0), r)
-    # added up, so that 1/r¹² cancels where it is not truncated
-    inside = function_of([Radial(r).sum_of_products(inside)], "r", np)
-    beyond = function_of([energy], "r", np)
-
-    def removed(distance: float) -> float:
-        if distance > potential.cutoff:
-            return beyond(distance)[0]
-        return float(inside(max(distance, CONTACT))[0])
-
-    start = (
-        potential.cutoff
-        if isinstance(potential.truncation, Unmodified)
-        else potential.truncation.start
-    )
-    ends = sorted({0.0, float(start), float(potential.cutoff)})
-    parts = [quad(lambda x: x**2 * removed(x), a, b)[0] for a, b in pairwise(ends)]
-    return sum(parts) + quad(lambda x: x**2 * beyond(x)[0], potential.cutoff, inf)[0], removed
-
-
-def _distances_in_molecules(view: ForceFieldView, i: int, j: int) -> Iterator[tuple[float, int]]:
-    """Distances (Å) of sites of the kinds i and j in one molecule, a site from itself included, and
-    their numbers."""
-    species = view.system.model.species
-    sites = view.system.sites_per_molecule
-    first = np.cumsum(sites) - sites
-    for k, member, molecules in zip(
-        *np.unique(species, return_index=True, return_counts=True), strict=True
-    ):
-        kind = view.kind[first[member] : first[member] + sites[member]]
-        position = view.system.species[k].positions_body
-        for a, b in product(position[kind == i], position[kind == j]):
-            yield float(np.linalg.norm(a - b)), int(molecules)

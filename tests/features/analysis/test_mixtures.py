@@ -4,13 +4,12 @@ plain NumPy.
 Everything on the other side is written out here: sums over all pairs and images, constants from SI.
 """
 
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.common import built, small_scene
+from support.common import small_scene
 from support.reference import inverse_power
 
 from rigidmd.assemble.build import build
@@ -23,7 +22,6 @@ from rigidmd.features.analysis.built_in.structure import (
 )
 from rigidmd.features.analysis.built_in.transport import msd
 from rigidmd.features.analysis.rigid_frames import RigidFrames
-from rigidmd.features.external.engines import compare_at
 
 GRAM_PER_CM3 = 1 / 1.66053906660  # u/Å³
 KELVIN = 1.380649e-23 / 1.66053906660e-27 * 1e20 / 1e24  # u Å²/ps²
@@ -489,15 +487,3 @@ def test_the_tail_gives_the_energy_of_a_crystal(name, edge):
         errors.append(within + (tail.energy_volume * density / 4 + tail.constant) / 4 - whole)
         less.append(tail.constant / 4)
     assert abs(np.mean(errors)) < 0.15 * np.mean(less)
-
-
-def test_the_tail_of_another_engine_is_another_number():
-    """For formulas that other programs evaluate: a wrong tail correction does not agree with
-    itself."""
-    forces = {"cutoff_A": 5.5, "truncation": "shift", "tail_correction": True}
-    system, engine, state = built(COUNTS, 16.0, forces=forces)
-    assert all(line.agrees for line in compare_at(system, state, engine, engine))
-    for wrong in ({"constant": 0.0}, {"energy_volume": 0.99 * system.tail.energy_volume}):
-        other = replace(system, tail=system.tail._replace(**wrong))
-        differ = [line.name for line in compare_at(other, state, engine, engine) if not line.agrees]
-        assert "lennard jones tail" in differ and "potential energy" in differ
