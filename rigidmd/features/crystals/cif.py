@@ -395,7 +395,8 @@ def _symmetry(
     symbol, its Hermann-Mauguin symbol, or the number of its space group, in this order. Statements
     of less rank select among the settings that are possible.
     """
-    statements = [*_listed(path, block), *_tabulated(block)]
+    stated_symmetry = [*_listed(path, block), *_tabulated(block)]
+    statements = [statement for statement in stated_symmetry if statement.settings]
     if not statements:
         if stated := block.first(*HALL, *NAMES, *NUMBERS):
             message = f"its space group {stated} is unknown: give its operations ({OPERATIONS[0]})"
@@ -430,25 +431,10 @@ def _symmetry(
     if of_system and not any(keep_cell(setting, cell) for setting in of_system):
         notes.append(f"its cell, {describe_cell(cell)}, is not {system}, as the file states")
     if not is_listed:
-        notes += [f"{what} is unknown" for what in _unknown(block)]
+        unknown = [statement.what for statement in stated_symmetry if not statement.settings]
+        unknown += [f"its crystal system {system}"] if system and not of_system else []
+        notes += [f"{what} is unknown" for what in unknown]
     return settings[0], notes
-
-
-def _unknown(block: Block) -> Iterator[str]:
-    """What a file states about its space group that no table has."""
-    name, symbol, number, code, system = (
-        block.first(*tags) for tags in (NAMES, HALL, NUMBERS, CODES, SYSTEMS)
-    )
-    if name and not settings_of_name(name):
-        yield f"its space group name {name}"
-    if symbol and not settings_of_hall(symbol):
-        yield f"its Hall symbol {symbol}"
-    if number and not settings_of_number(parse_whole_number(number) or 0):
-        yield f"its space group number {number}"
-    if code and not settings_of_code(code):
-        yield f"its coordinate system code {code}"
-    if system and not settings_of_system(system):
-        yield f"its crystal system {system}"
 
 
 def _described(settings: "list[gemmi.GroupOps]", used: Statement) -> str:
@@ -504,20 +490,20 @@ def _listed(path: Path, block: Block) -> Iterator[Statement]:
     yield Statement(LISTED, [groups[0]])
 
 
-def _tabulated(block: Block) -> Iterator[Statement]:
-    """What a file states about its space group, in the order of rank."""
-    number = parse_whole_number(block.first(*NUMBERS) or "")
+def _tabulated(block: Block) -> list[Statement]:
+    """What a file states about its space group, in the order of rank, with no settings for what no
+    table has."""
     statements = []
     if symbol := block.first(*HALL):
         statements.append(Statement(f"its Hall symbol {symbol}", settings_of_hall(symbol)))
     names = dict.fromkeys(name for tag in NAMES if (name := block.first(tag)))
     statements += [Statement(f"its space group {name}", settings_of_name(name)) for name in names]
-    if number is not None:
-        statements.append(Statement(f"its space group number {number}", settings_of_number(number)))
-    statements = [statement for statement in statements if statement.settings]
-    yield from statements
-    if statements and (code := block.first(*CODES)) and (settings := settings_of_code(code)):
-        yield Statement(f"its coordinate system code {code}", settings)
+    if number := block.first(*NUMBERS):
+        settings = settings_of_number(parse_whole_number(number) or 0)
+        statements.append(Statement(f"its space group number {number}", settings))
+    if any(statement.settings for statement in statements) and (code := block.first(*CODES)):
+        statements.append(Statement(f"its coordinate system code {code}", settings_of_code(code)))
+    return statements
 
 
 def _contents(

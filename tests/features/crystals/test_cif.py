@@ -283,7 +283,7 @@ def test_what_is_stated_wrongly_next_to_operations_is_reported(tmp_path):
     assert "the density in the file is 2.5 g/cm³, but its atoms make 0.1693 g/cm³" in notes
     assert "its formula and Z are H4 O2 in the cell, but its atoms make H8 O4" in notes
     unknown = read(tmp_path, cif(MONOCLINIC, **{NAME: "P wrong", NUMBER: 14}))
-    assert "its space group name P wrong is unknown" in unknown.notes
+    assert "its space group P wrong is unknown" in unknown.notes
 
 
 @pytest.mark.parametrize("operations", [(), ("x,y,z",)])
