@@ -89,6 +89,10 @@ class State(NamedTuple):
             if array.size
         )
 
+    def time_of(self, step: int, dt: float) -> float:
+        """The time at a step of the current segment, whose steps have the length dt."""
+        return self.time[ORIGIN] + (step - self.step[ORIGIN]) * dt
+
     def begin_segment(self, time: float | None = None) -> None:
         """Begin a segment of equal steps, in place. `time` is the current time if it is known
         exactly."""

@@ -20,14 +20,8 @@ from rigidmd.features.bodies.forces.applied import PythonForce, SteadyForce, Tim
 from rigidmd.features.bodies.forces.resistance import NoResistance, Resistance
 from rigidmd.features.bodies.keys.body import SolidPart, axis_of_symmetry
 from rigidmd.features.bodies.keys.forces import Fluid, Friction, Timed
-from rigidmd.features.bodies.keys.solids import (
-    Assembly,
-    Part,
-    added_mass_of_ellipsoid,
-    assemble_solids,
-    solid,
-)
-from rigidmd.features.bodies.motion import energies
+from rigidmd.features.bodies.keys.solids import added_mass_of_ellipsoid, solid
+from rigidmd.features.bodies.motion import energies_of
 from rigidmd.features.bodies.step_loop import Body
 from rigidmd.features.bodies.system import BodySystem, Pose
 from rigidmd.features.bodies.time_functions import (
@@ -137,14 +131,10 @@ def build_body(
     return system
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def has_finite_energy(system: BodySystem) -> bool:
     """Whether the energies of a body at its start are numbers."""
-    times = system.state.time[:1]
-    states = State(*(array[None] for array in system.state))
-    with np.errstate(over="ignore", invalid="ignore"):
-        return all(
-            bool(np.isfinite(values).all()) for values in energies(system, times, states).values()
-        )
+    return all(np.isfinite(energy) for energy in energies_of(system, system.state).values())
 
 
 def _first_state(scene, body, moments, axes, attitude, spin, rotates) -> State:
@@ -370,19 +360,31 @@ def inertia_of(
     return mass, tensor, np.zeros(3), points, tuple(f"P{k}" for k in range(1, len(points) + 1))
 
 
+class Assembly(NamedTuple):
+    """A body of several solids, along the body's axes: mass, centre of mass (3,), inertia tensor
+    (3, 3) about it, and the outline (k, 3) of each solid from it."""
+
+    mass: float
+    centre: np.ndarray
+    tensor: np.ndarray
+    outlines: list[np.ndarray]
+
+
 def assembled(solids: Sequence[SolidPart]) -> Assembly:
-    """The body of [[body.solids]], in their axes."""
-    return assemble_solids(
-        [
-            Part(
-                part.mass,
-                solid(part.shape, part.mass, part.dimensions),
-                np.array(part.position_m),
-                part.rotation,
-            )
-            for part in solids
-        ]
-    )
+    """The rigid body of [[body.solids]], whose masses and inertia add up, by the parallel axis
+    theorem. Where solids overlap, both masses are there."""
+    masses = np.array([part.mass for part in solids])
+    mass = float(masses.sum())
+    centre = masses @ np.array([part.position_m for part in solids]) / mass
+    tensor = np.zeros((3, 3))
+    outlines = []
+    for part in solids:
+        shape = solid(part.shape, part.mass, part.dimensions)
+        position = part.position_m - centre
+        tensor_of_part = part.rotation @ np.diag(shape.inertia) @ part.rotation.T
+        tensor += shifted_inertia(tensor_of_part, part.mass, position)
+        outlines.append(position + shape.outline @ part.rotation.T)
+    return Assembly(mass, centre, 0.5 * (tensor + tensor.T), outlines)
 
 
 def inertia_at_centre(scene: BodyScene) -> np.ndarray:

@@ -7,13 +7,15 @@ import numpy as np
 
 from rigidmd.core.quantities import Quantity
 from rigidmd.core.toml import Json
-from rigidmd.features.bodies.motion import COLUMNS
+from rigidmd.features.bodies.animation import BodyAnimation
+from rigidmd.features.bodies.figures import body_figures, body_panels, timeline
+from rigidmd.features.bodies.motion import COLUMNS, Motion
+from rigidmd.features.bodies.summary import motion_figures, rows_of, title_of
 from rigidmd.features.view.kind_display import KindDisplay
+from rigidmd.features.view.page import section, table
 from rigidmd.scene.validation import not_none
 
 if TYPE_CHECKING:
-    from rigidmd.features.bodies.animation import BodyAnimation
-    from rigidmd.features.bodies.motion import Motion
     from rigidmd.features.bodies.system import BodySystem
     from rigidmd.features.view.figures.panels import Panel, Timeline
     from rigidmd.features.view.figures.picture import Picture
@@ -22,49 +24,33 @@ if TYPE_CHECKING:
     from rigidmd.run.simulation import Simulation
 
 
-class BodyDisplay(KindDisplay["BodySystem", "Motion"]):
+class BodyDisplay(KindDisplay["BodySystem", Motion]):
     title = "one rigid body"
     step_unit = "s"
     margins_note = ""
 
-    def figures(
-        self, system: "BodySystem", samples: "Motion", summary: Json
-    ) -> "dict[str, Picture]":
-        from rigidmd.features.bodies.figures import body_figures
-
+    def figures(self, system: "BodySystem", samples: Motion, summary: Json) -> "dict[str, Picture]":
         return body_figures(system, samples)
 
     def timeline(self, system: "BodySystem", columns: Mapping[str, np.ndarray]) -> "Timeline":
-        from rigidmd.features.bodies.figures import timeline
-
         return timeline(columns)
 
     def panels(self, system: "BodySystem", columns: Mapping[str, np.ndarray]) -> "list[Panel]":
-        from rigidmd.features.bodies.figures import body_panels
-
         return [panel for family in body_panels(system, columns).values() for panel in family]
 
-    def animation(self, record: "Record", most_frames: int | None = None) -> "BodyAnimation":
-        from rigidmd.features.bodies.animation import BodyAnimation
-
+    def animation(self, record: "Record", most_frames: int | None = None) -> BodyAnimation:
         return BodyAnimation(record)
 
-    def animation_in_memory(self, results: "Results", record: "Record") -> "BodyAnimation":
+    def animation_in_memory(self, results: "Results", record: "Record") -> BodyAnimation:
         return self.animation(record)
 
     def tables(
         self, system: "BodySystem", summary: Json
     ) -> list[tuple[str, list[tuple[str, str]]]]:
-        from rigidmd.features.bodies.summary import rows_of, title_of
-
         # not of a run that has not ended
         return [(title_of(summary), rows_of(summary))] if "steps" in summary else []
 
     def results_section(self, record: "Record") -> str:
-        from rigidmd.features.bodies.motion import Motion
-        from rigidmd.features.bodies.summary import motion_figures, rows_of
-        from rigidmd.features.view.page import section, table
-
         time = ("time", f"{record.time[-1]:g} s, {len(record.time)} samples")
         numbers = motion_figures(record.system, Motion(record.columns))
         return section("Results", table([], [time, *rows_of(numbers)], words=True))

@@ -1,7 +1,8 @@
 """Edges between the points of a body, for viewers and topology files: outlines of its solids, and
 links between them."""
 
-from itertools import combinations, pairwise
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,9 +13,18 @@ from rigidmd.formats.bonds import shortest_links
 if TYPE_CHECKING:
     from rigidmd.features.bodies.system import BodySystem
 
-#: Distance from a flat side of a hull, relative to its size, of points on it. Thickness relative to
-#: the size below which points lie in a plane or on a line.
-FLAT, THIN = 1e-6, 1e-9
+#: Polygons of the outlines of `SOLIDS`, by their points. Neighbours are joined corner by corner.
+_BALL = [0], range(1, 9), range(9, 17), range(17, 25), [25]
+POLYGONS: dict[str, Sequence[Sequence[int]]] = {
+    "cylinder": (range(1, 13), range(13, 25)),
+    "cone": ([0], range(9, 25)),
+    "sphere": _BALL,
+    "ellipsoid": _BALL,
+    "cuboid": ([0, 2, 8, 6], [17, 19, 25, 23]),
+    "disk": (range(9, 25),),
+    "ring": (range(24),),
+    "rod": [[k] for k in range(13)],
+}
 
 
 def edges_of(system: "BodySystem") -> np.ndarray:
@@ -26,25 +36,25 @@ def edges_of(system: "BodySystem") -> np.ndarray:
     if body.points is not None:
         pairs = first + shortest_links(points)
     elif body.solids is not None:
-        pairs = first + _edges_of_solids(
-            points, [len(SOLIDS[part.shape].outline) for part in body.solids]
-        )
+        pairs = first + _edges_of_solids(points, [part.shape for part in body.solids])
+    elif body.solid is not None:
+        pairs = first + _outline(POLYGONS[body.solid.shape])
     else:
-        pairs = first + _hull(points)
+        pairs = first + _edges_of_ellipsoid(points)
     if first and len(points):
         nearest = int(np.linalg.norm(points - system.centre, axis=1).argmin())
         pairs = np.vstack([[0, first + nearest], pairs])
     return pairs.astype(int)
 
 
-def _edges_of_solids(points: np.ndarray, counts: list[int]) -> np.ndarray:
-    """Edges (b, 2) of the hulls of solids, whose points follow one another, and the shortest links
-    that join the solids.
-
-    counts : number of points of each solid
-    """
-    starts = np.cumsum([0, *counts])
-    edges = [start + _hull(points[start:end]) for start, end in pairwise(starts.tolist())]
+def _edges_of_solids(points: np.ndarray, shapes: list[str]) -> np.ndarray:
+    """Edges (b, 2) of solids, whose points follow one another, and the shortest links that join the
+    solids."""
+    starts = np.cumsum([0, *(len(SOLIDS[shape].outline) for shape in shapes)])
+    edges = [
+        start + _outline(POLYGONS[shape])
+        for start, shape in zip(starts[:-1].tolist(), shapes, strict=True)
+    ]
     joined = np.arange(starts[1])
     free = np.arange(starts[1], len(points))
     while len(free):
@@ -58,46 +68,20 @@ def _edges_of_solids(points: np.ndarray, counts: list[int]) -> np.ndarray:
     return np.concatenate(edges)
 
 
-def _hull(points: np.ndarray) -> np.ndarray:
-    """Convex-hull edges for points in space, in a plane or on a line: the outline of a solid.
-    Points inside, and those between the corners of a side, have none."""
-    if len(points) < 2:
+def _edges_of_ellipsoid(points: np.ndarray) -> np.ndarray:
+    """Edges between the tips of an ellipsoid. Points (7, 3) are its centre and its tips."""
+    tips = points[:4] - points[0]
+    if len(points) == 1:
         return np.zeros((0, 2), int)
-    flat = _flattened(points)
-    if flat.shape[1] == 1:
-        order = flat[:, 0].argsort()
-        return np.stack([order[:-1], order[1:]], axis=-1)
-    sides = [np.arange(len(points))] if flat.shape[1] == 2 else _sides(flat)
-    edges: dict[tuple[int, int], None] = {}
-    for side in sides:
-        outline = _flattened(points[side])
-        for ends in _sides(outline):
-            along = _flattened(outline[ends])[:, 0]
-            corners = int(side[ends[along.argmin()]]), int(side[ends[along.argmax()]])
-            edges[min(corners), max(corners)] = None
-    return np.array(list(edges))
+    if not tips[2].any():
+        return _outline([[1], [0], [4]])
+    equator = [1, 2, 4, 5]
+    return _outline([[3], equator, [6]] if tips[3].any() else [equator])
 
 
-def _flattened(points: np.ndarray) -> np.ndarray:
-    """Coordinates (n, d) of points along the axes in which they extend, d of them."""
-    centred = points - points.mean(axis=0)
-    _, spread, axes = np.linalg.svd(centred)
-    return centred @ axes[: int((spread > THIN * spread[0]).sum())].T
-
-
-def _sides(points: np.ndarray) -> list[np.ndarray]:
-    """Indices of the points on each side of a hull, a line in a plane or a plane in space: all
-    points lie on it or behind it."""
-    chosen = np.array(list(combinations(range(len(points)), points.shape[1])))
-    first = points[chosen[:, 0]]
-    one, other = points[chosen[:, 1]] - first, points[chosen[:, -1]] - first
-    normals = one[:, ::-1] * [-1, 1] if points.shape[1] == 2 else np.cross(one, other)
-    size = np.linalg.norm(normals, axis=1)
-    spans = size > THIN * size.max()
-    normals = normals[spans] / size[spans, None]
-    first = first[spans]
-    heights = normals @ points.T - np.einsum("ti,ti->t", normals, first)[:, None]
-    tolerance = FLAT * np.abs(points).max()
-    supports = (heights.min(axis=1) > -tolerance) | (heights.max(axis=1) < tolerance)
-    masks = np.unique(np.abs(heights[supports]) < tolerance, axis=0)
-    return [np.flatnonzero(mask) for mask in masks]
+def _outline(polygons: Sequence[Sequence[int]]) -> np.ndarray:
+    """Edges (b, 2) of polygons, and between neighbouring ones."""
+    corners = [np.array(polygon) for polygon in polygons]
+    sides = [np.stack([p, np.roll(p, -1)], axis=-1) for p in corners if len(p) > 1]
+    links = [np.stack(np.broadcast_arrays(p, q), axis=-1) for p, q in pairwise(corners)]
+    return np.concatenate([*sides, *links])

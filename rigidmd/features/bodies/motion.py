@@ -1,19 +1,18 @@
 """The motion of a single body: the columns of motion.csv, with the errors of the conserved
 quantities."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.core.quantities import Quantity
-from rigidmd.core.state import WORK, State
+from rigidmd.core.state import NOW, WORK, State
 from rigidmd.engines.samples import MATRIX, SampleTable
 from rigidmd.features.bodies.driven_rotor import DrivenRotor
 from rigidmd.features.bodies.forces.applied import (
     PythonForce,
-    SteadyForce,
     TimeDependentForce,
     steady_energies,
 )
@@ -91,11 +90,6 @@ COLUMNS = {
 NAMES = {name: name for name in COLUMNS} | {"t": "time"} | {c.header: n for n, c in COLUMNS.items()}
 
 
-class Snapshot(NamedTuple):
-    time: float
-    state: State
-
-
 @dataclass(repr=False)
 class Motion(SampleTable):
     """The samples of a run as columns.
@@ -130,10 +124,19 @@ class Motion(SampleTable):
         return self.columns[name]
 
 
-def motion(system: BodySystem, snapshots: list[Snapshot]) -> Motion:
-    times = np.array([s.time for s in snapshots])
-    parts = [np.array([s.state[k] for s in snapshots]) for k in range(len(State._fields) - 1)]
-    states = State._make([*parts, np.zeros(0)])
+def stacked(states: Sequence[State], names: Sequence[str] = State._fields) -> dict[str, np.ndarray]:
+    """The arrays of states, stacked along axis 0, by name."""
+    return {name: np.array([getattr(state, name) for state in states]) for name in names}
+
+
+def states_of(arrays: Mapping[str, np.ndarray]) -> list[State]:
+    """The states of arrays that are stacked."""
+    return [State(*state) for state in zip(*(arrays[n] for n in State._fields), strict=True)]
+
+
+def motion(system: BodySystem, samples: Sequence[State]) -> Motion:
+    states = State(**stacked(samples, State._fields[:-1]), extra_variables=np.zeros(0))
+    times = states.time[:, NOW]
     position, velocity, rotation, omega = system.motion(times, states)
     columns = {"time": times} | _columns("position", position) | _columns("velocity", velocity)
     if system.rotates:
@@ -177,6 +180,12 @@ def is_balanced(system: BodySystem) -> bool:
     return isinstance(frame, InertialFrame) or is_constant_function(frame.angular_velocity)
 
 
+def energies_of(system: BodySystem, state: State) -> dict[str, float]:
+    """The columns of `energies` at one state, J."""
+    columns = energies(system, state.time[:1], State(*(array[None] for array in state)))
+    return {name: float(values[0]) for name, values in columns.items()}
+
+
 def energies(system: BodySystem, times: np.ndarray, states: State) -> dict[str, np.ndarray]:
     """Kinetic energy (less Omega . J in a rotating frame), potential energy, their sum, and work of
     other forces."""
@@ -200,9 +209,8 @@ def energies(system: BodySystem, times: np.ndarray, states: State) -> dict[str, 
         kinetic += 0.5 * (along**2 / inertial_masses(system.body.translation)).sum(axis=1)
         about_origin += np.cross(position, impulse)
     kinetic -= (system.frame_rates(times) * about_origin).sum(axis=1)
-    for term in system.terms.values():
-        if isinstance(term, SteadyForce):
-            potential += steady_energies(term, states.position, states.rotation)
+    for term in system.steady_forces:
+        potential += steady_energies(term, states.position, states.rotation)
     return {
         "kinetic": kinetic,
         "potential": potential,
@@ -214,7 +222,7 @@ def energies(system: BodySystem, times: np.ndarray, states: State) -> dict[str, 
 def _errors(system: BodySystem, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Relative changes since the start of the quantities that this scene conserves."""
     body = system.body
-    forces = [term for term in system.terms.values() if isinstance(term, SteadyForce)]
+    forces = system.steady_forces
     driven = any(
         isinstance(term, TimeDependentForce | PythonForce) for term in system.terms.values()
     )

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.features.bodies.forces.applied import PythonForce, SteadyForce, TimeDependentForce
+from rigidmd.features.bodies.forces.applied import PythonForce, TimeDependentForce
 from rigidmd.features.bodies.forces.resistance import NoResistance
 from rigidmd.features.bodies.keys.body import EQUAL_MOMENTS
 from rigidmd.features.bodies.motion import Motion
@@ -51,9 +51,7 @@ def body_rates(system: BodySystem, motion: Motion) -> dict[str, Rate]:
         or not isinstance(system.body.frame, InertialFrame)
     ):
         return {}
-    forces = [
-        term for term in system.terms.values() if isinstance(term, SteadyForce) and term.force.any()
-    ]
+    forces = [term for term in system.steady_forces if term.force.any()]
     # the direction of all forces, and the sum of force times point of action along it: U = -down .
     # Q moment
     down = forces[0].force / np.linalg.norm(forces[0].force) if forces else np.zeros(3)

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from pydantic import PositiveFloat
 
-from rigidmd.assemble.harmonic import stable_angle
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import NOW, ORIGIN, State, state_of
 from rigidmd.core.toml import Json
@@ -17,9 +16,15 @@ from rigidmd.engines.protocol import NotFiniteError
 from rigidmd.engines.samples import MATRIX
 from rigidmd.errors import SimulationError, StructureError
 from rigidmd.features.bodies.assemble import build_body
-from rigidmd.features.bodies.forces.applied import SteadyForce
-from rigidmd.features.bodies.motion import Motion, Snapshot, energies, is_balanced, motion
-from rigidmd.features.bodies.stable_step import fastest_rate, step_warnings
+from rigidmd.features.bodies.motion import (
+    Motion,
+    energies_of,
+    is_balanced,
+    motion,
+    stacked,
+    states_of,
+)
+from rigidmd.features.bodies.stable_step import stable_step, step_warnings
 from rigidmd.features.bodies.summary import summarise_body, summary_text
 from rigidmd.features.bodies.system import BodySystem, Pose
 from rigidmd.formats import format_of
@@ -45,40 +50,26 @@ EVALUATIONS_PER_CHECK, SAMPLES_PER_CHECK = 1_000_000, 512
 
 
 class Sampler(Observer):
-    """Keeps snapshots, of which columns are made at the end."""
+    """Keeps states, of which columns are made at the end."""
 
     remembers: ClassVar[dict[str, object]] = {"stacked": Arrays}
     ends = True
 
     def __init__(self, interval: float):
         self.interval = interval
-        self.snapshots: list[Snapshot] = []
+        self.states: list[State] = []
 
     @property
     def stacked(self) -> dict[str, np.ndarray]:
-        """The arrays of all snapshots, by name."""
-        columns = {
-            name: np.array([snapshot.state[k] for snapshot in self.snapshots])
-            for k, name in enumerate(State._fields)
-        }
-        return columns | {"t": np.array([snapshot.time for snapshot in self.snapshots])}
+        """The arrays of all states, by name."""
+        return stacked(self.states)
 
     @stacked.setter
-    def stacked(self, stacked: dict[str, np.ndarray]) -> None:
-        times = stacked.pop("t")
-        states = [State(*(stacked[name][k] for name in State._fields)) for k in range(len(times))]
-        self.snapshots = [
-            Snapshot(time, state) for time, state in zip(times.tolist(), states, strict=True)
-        ]
+    def stacked(self, arrays: dict[str, np.ndarray]) -> None:
+        self.states = states_of(arrays)
 
     def see(self, moment: Moment) -> None:
-        self.snapshots.append(Snapshot(moment.time, moment.state))
-
-
-def energies_of(system: BodySystem, state: State) -> dict[str, float]:
-    """The columns of `energies` at one state, J."""
-    columns = energies(system, state.time[:1], State(*(array[None] for array in state)))
-    return {name: float(values[0]) for name, values in columns.items()}
+        self.states.append(moment.state)
 
 
 class BodyWatch(Observer):
@@ -98,25 +89,23 @@ class BodyWatch(Observer):
         step_limit = EVALUATIONS_PER_CHECK // getattr(system.method, "force_evaluations", 1)
         self.steps = min(step_limit, SAMPLES_PER_CHECK * every)
         self._start = energies_of(system, system.state)
-        weights = [term for term in system.terms.values() if isinstance(term, SteadyForce)]
-        swing = sum(np.linalg.norm(term.force) * np.linalg.norm(term.point) for term in weights)
+        swing = sum(
+            np.linalg.norm(term.force) * np.linalg.norm(term.point) for term in system.steady_forces
+        )
         self.exchanged = abs(self._start["kinetic"]) + (
             0.0 if system.translates else 2 * float(swing)
         )
 
-    def see(self, moment: Moment) -> None:
-        if problem := self._failed_check(self._run._part.state, self._run._part.segment.dt):
-            raise problem
-
     @np.errstate(over="ignore", invalid="ignore")
-    def _failed_check(self, state: State, dt: float) -> FailedCheck | None:
+    def see(self, moment: Moment) -> None:
         system, limits = self._system, self._limits
+        state, dt = self._run._part.state, self._run._part.segment.dt
         largest = not_none(limits.orthogonality)
         if largest and not (worst := orthogonality_error(state.rotation)) <= largest:
             message = (
                 f"Q is not a rotation: |QᵀQ - 1| is {worst:.2g} (watch.orthogonality = {largest:g})"
             )
-            return FailedCheck(message, rotation_not_orthogonal=True)
+            raise FailedCheck(message, rotation_not_orthogonal=True)
         if system.rotates and limits.turn_rad:
             omega = system.pose(float(state.time[0]), state).angular_velocity_body
             angle = dt * float(np.linalg.norm(omega))
@@ -125,9 +114,9 @@ class BodyWatch(Observer):
                     f"the body rotates by {angle:.3g} rad in a step (watch.turn_rad ="
                     f" {limits.turn_rad:g})"
                 )
-                return FailedCheck(message, factor=angle / limits.turn_rad)
+                raise FailedCheck(message, factor=angle / limits.turn_rad)
         if not limits.energy or not is_balanced(system):
-            return None
+            return
         start = self._start
         now = energies_of(system, state)
         self.exchanged = max(
@@ -135,13 +124,12 @@ class BodyWatch(Observer):
         )
         error = abs(now["energy"] - now["work"] - start["energy"] + start["work"])
         scale = self.exchanged + ROUNDING * abs(now["energy"])
-        if error <= limits.energy * scale:
-            return None
-        return FailedCheck(
-            f"the energy minus the work done changed by {error:.3g} J,"
-            f" {error / scale if scale else inf:.3g} of all energy exchanged (watch.energy ="
-            f" {limits.energy:g})"
-        )
+        if not error <= limits.energy * scale:
+            raise FailedCheck(
+                f"the energy minus the work done changed by {error:.3g} J,"
+                f" {error / scale if scale else inf:.3g} of all energy exchanged (watch.energy ="
+                f" {limits.energy:g})"
+            )
 
     def explain(self, error: SimulationError, stable: float | None) -> str:
         """The message of a failed check in full: what was observed, the likely cause, what to try.
@@ -203,9 +191,9 @@ class MotionFiles(Observer):
             results.files.append(run.path(MOTION_NPZ))
 
     def failed(self, run: "Simulation") -> str:
-        if not self._sampler.snapshots:
+        if not self._sampler.states:
             return ""
-        write_columns(run.path(MOTION), motion(run.system, self._sampler.snapshots).written)
+        write_columns(run.path(MOTION), motion(run.system, self._sampler.states).written)
         return f". The motion so far: {run.path(MOTION)}"
 
 
@@ -283,12 +271,7 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
                 " order 1. For friction and resistance use [friction] and [fluid], which keep"
                 " order 2. Otherwise integrator = 'dop853'"
             )
-        rate = fastest_rate(system)
-        angle = stable_angle(system.method)
-        # some solvers choose their own steps
-        if not self.scene.watch.stable_step or rate == 0 or angle == inf:
-            return
-        self.record.stable = angle / rate
+        self.record.stable = stable_step(system)
         for sentence in step_warnings(system):
             self.simulation._note(sentence)
 
@@ -369,7 +352,7 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
         return [Figures(FIGURES, ("png", "svg"))]
 
     def samples(self) -> Motion:
-        return motion(self.system, self._sampler.snapshots)
+        return motion(self.system, self._sampler.states)
 
     def summary(self, samples: Motion, preparing: float, wall: float) -> Json:
         steps = sum(segment.steps for segment in self._segments)
@@ -417,7 +400,7 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
         with interruptible():
             self.prepare()
         load, _ = self.engine.evaluate(self.state)
-        columns = motion(self.system, [Snapshot(0.0, self.state)])
+        columns = motion(self.system, [self.state])
         torque = load.torque_body @ self.system.axes.T
         return {
             "unit": "J",

@@ -6,21 +6,27 @@ import numpy as np
 
 from rigidmd.assemble.harmonic import INACCURATE, stable_angle, step_error
 from rigidmd.core.integrators import Scheme
-from rigidmd.features.bodies.forces.applied import SteadyForce
 from rigidmd.features.bodies.system import BodySystem
 from rigidmd.mechanics.free_rotor import SplitRotor
+
+
+def stable_step(system: BodySystem) -> float | None:
+    """The longest stable step (s) at the start. None for a body at rest, for solvers that choose
+    their own steps, or if the scene does not want it."""
+    rate, angle = fastest_rate(system), stable_angle(system.method)
+    return angle / rate if system.scene.watch.stable_step and rate > 0 and angle < inf else None
 
 
 def step_warnings(system: BodySystem) -> list[str]:
     """Warnings of a step that is unstable or inaccurate for the motion of a body at its start."""
     run, method = system.scene.run, system.method
-    rate, angle = fastest_rate(system), stable_angle(method)
-    # some solvers choose their own steps
-    if not system.scene.watch.stable_step or rate == 0 or angle == inf:
+    longest = stable_step(system)
+    if longest is None:
         return []
+    rate = fastest_rate(system)
     moves = f"at its start the body swings or spins at {rate:.3g} rad/s"
-    if run.timestep_s > angle / rate:
-        follows = f"which {run.integrator} can follow up to {angle / rate:.3g} s"
+    if run.timestep_s > longest:
+        follows = f"which {run.integrator} can follow up to {longest:.3g} s"
         return [
             f"timestep_s = {run.timestep_s:g} is longer than what is stable: {moves}, {follows}"
         ]
@@ -45,7 +51,7 @@ def fastest_rate(system: BodySystem) -> float:
     if not system.rotates:
         return 0.0
     inertia, momentum = system.inertia, system.state.angular_momentum_body[0]
-    weights = [term for term in system.terms.values() if isinstance(term, SteadyForce)]
+    weights = system.steady_forces
     stiffness, spins = np.zeros(3), np.divide(momentum, inertia, out=np.zeros(3), where=inertia > 0)
     for term in weights:
         arms = np.sqrt(np.maximum(term.point @ term.point - term.point**2, 0.0))

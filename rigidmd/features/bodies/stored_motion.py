@@ -6,7 +6,7 @@ import numpy as np
 
 from rigidmd.core.state import State
 from rigidmd.errors import CheckpointError, OutputError
-from rigidmd.features.bodies.motion import COLUMNS, FAMILIES, NAMES, Snapshot, motion
+from rigidmd.features.bodies.motion import COLUMNS, NAMES, motion, states_of
 from rigidmd.features.bodies.system import BodySystem
 from rigidmd.io.checkpoint import latest
 from rigidmd.io.folder import MOTION
@@ -16,25 +16,7 @@ from rigidmd.io.run_files import Columns, read_columns
 def columns_of_run(folder: Path, system: BodySystem, missing: list[str]) -> dict[str, np.ndarray]:
     """Columns of motion.csv, or, of a run that has not written it, of its last checkpoint."""
     if (columns := read_motion(folder / MOTION)) is not None:
-        # that every motion has
-        families = [
-            "time",
-            "position",
-            "kinetic",
-            "potential",
-            "energy",
-            "work",
-        ]
-        if system.rotates:
-            families += [
-                "rotation",
-                "quaternion",
-                "euler_angles",
-                "omega_body",
-                "omega_lab",
-                "L_lab",
-            ]
-        needed = [name for family in families for name in FAMILIES[family].names]
+        needed = motion(system, [system.state]).columns
         if lacking := [COLUMNS[name].header for name in needed if name not in columns.cells]:
             raise OutputError(
                 f"{columns.path} is not the motion of this run: it has no column {lacking[0]!r}"
@@ -46,14 +28,12 @@ def columns_of_run(folder: Path, system: BodySystem, missing: list[str]) -> dict
         return {}
     for owner in checkpoint.values.get("of", {}):
         part = checkpoint.of(owner).arrays
-        if "stacked/t" in part:  # of `run.Sampler`
-            states = zip(*(part[f"stacked/{name}"] for name in State._fields), strict=True)
-            times = part["stacked/t"].tolist()
-            snapshots = [Snapshot(t, State(*state)) for t, state in zip(times, states, strict=True)]
+        if "stacked/time" in part:  # of `run.Sampler`
+            states = states_of({name: part[f"stacked/{name}"] for name in State._fields})
             missing.append(
                 f"{MOTION} is written at the end. The motion shown ends at the last checkpoint."
             )
-            return motion(system, snapshots).columns
+            return motion(system, states).columns
     return {}
 
 

@@ -14,6 +14,7 @@ from rigidmd.engines.sites import Sites
 from rigidmd.errors import SimulationError
 from rigidmd.features.bodies.cpu_engine import BodyEngine
 from rigidmd.features.bodies.driven_rotor import DrivenRotor
+from rigidmd.features.bodies.forces.applied import SteadyForce
 from rigidmd.features.bodies.forces.resistance import NoResistance
 from rigidmd.features.bodies.keys.body import FORMULATION, SAMPLES
 from rigidmd.features.bodies.step_loop import Body
@@ -111,6 +112,11 @@ class BodySystem:
     def translates(self) -> bool:
         """Whether the body is not pinned."""
         return len(self.state.position) > 0
+
+    @property
+    def steady_forces(self) -> list[SteadyForce]:
+        """The terms that have a potential energy."""
+        return [term for term in self.terms.values() if isinstance(term, SteadyForce)]
 
     @property
     def kind(self) -> BodyKind:

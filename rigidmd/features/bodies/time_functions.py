@@ -85,10 +85,10 @@ def values_at(function: TimeFunction, times: np.ndarray) -> np.ndarray:
 
 def piece_at(function: TimeFunction, time: float) -> TimeFunction:
     """The piece that starts or continues at a time, as a function without an end."""
-    i, d = _locate(function, np.array([time]))
-    constant = function.constant[i] + d * (function.slope[i] + d * function.curvature[i])
+    times = np.array([time])
+    i, d = _locate(function, times)
     slope = function.slope[i] + 2 * d * function.curvature[i]
-    return TimeFunction(np.array([time]), constant, slope, function.curvature[i])
+    return TimeFunction(times, values_at(function, times), slope, function.curvature[i])
 
 
 def sum_functions(functions: list[TimeFunction]) -> TimeFunction:

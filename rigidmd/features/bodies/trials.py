@@ -9,10 +9,11 @@ from math import ceil, gcd
 import numpy as np
 
 from rigidmd.core.integrators import SCHEMES, Solver
+from rigidmd.core.state import State
 from rigidmd.errors import SceneError
 from rigidmd.features.bodies.assemble import build_body
 from rigidmd.features.bodies.keys.body import SAMPLES, BodyScene
-from rigidmd.features.bodies.motion import Snapshot, motion
+from rigidmd.features.bodies.motion import motion
 from rigidmd.features.bodies.ode.rates import SMALLEST_SINE
 from rigidmd.features.bodies.system import BodySystem, Pose
 from rigidmd.run.pilot.choice import choose
@@ -35,16 +36,15 @@ def body_trial_system(
     fits, refused = _systems_of_methods(scene, applied)
     system = fits["velocity_verlet"]
     duration = min([span or scene.run.duration_s, *system.breaks()])
-    snapshots = _coarse_motion(system, duration)
-    columns = motion(system, snapshots)
+    columns = motion(system, _coarse_motion(system, duration))
     kinetic = float(np.abs(columns["kinetic"]).max()) or 1.0
 
     def energy(engine, state) -> float:
-        now = motion(system, [Snapshot(float(state.time[0]), state)])
+        now = motion(system, [state])
         return float(now["energy"][0] - now["work"][0])
 
     def conserved_errors(state) -> dict[str, float]:
-        columns_of_two = motion(system, [snapshots[0], Snapshot(float(state.time[0]), state)])
+        columns_of_two = motion(system, [system.state, state])
         return {
             name: float(columns_of_two[f"{name}_error"][-1])
             for name in columns_of_two.invariants
@@ -127,16 +127,16 @@ def _systems_of_methods(
     return fits, refused
 
 
-def _coarse_motion(system: BodySystem, duration: float) -> list[Snapshot]:
+def _coarse_motion(system: BodySystem, duration: float) -> list[State]:
     """A run that only measures how fast the body moves."""
     engine = system.engine()
     state = engine.begin(system.state, system.method)
-    snapshots = [Snapshot(0.0, system.state)]
+    states = [system.state]
     every = COARSE_STEPS // COARSE_SAMPLES
     for step in range(every, COARSE_STEPS + every, every):
         engine.advance(state, system.method, duration / COARSE_STEPS, step)
-        snapshots.append(Snapshot(float(state.time[0]), state.copy()))
-    return snapshots
+        states.append(state.copy())
+    return states
 
 
 def choose_for_body(

@@ -15,7 +15,7 @@ import numpy as np
 
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.programs import Program
-from rigidmd.core.state import NOW, ORIGIN, State
+from rigidmd.core.state import NOW, State
 from rigidmd.engines.observables import kinetic_energies, observe
 from rigidmd.engines.protocol import Engine, keep_time
 from rigidmd.engines.system import System
@@ -165,7 +165,7 @@ class ExternalEngine(Engine, ABC):
         self._run(state, steps, dt)
         self._receive(state)
         state.step[NOW] = until
-        state.time[NOW] = state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt
+        state.time[NOW] = state.time_of(until, dt)
         self._known_state = state.copy()
 
     def forget(self) -> None:

@@ -8,8 +8,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidmd.mechanics.inertia import shifted_inertia
-
 
 class Solid(NamedTuple):
     """A homogeneous solid: principal moments `inertia` (3,) and points `outline` (k, 3) to draw,
@@ -111,44 +109,6 @@ def solid(shape: str, mass: float, dimensions: Mapping[str, float | Sequence[flo
     scale = unit.scale(dimensions)
     spread = mass * scale**2 * unit.mean_squares
     return Solid(spread[[1, 2, 0]] + spread[[2, 0, 1]], unit.outline * scale)
-
-
-class Part(NamedTuple):
-    """A solid of a body: its mass, its own `Solid`, the position (3,) of its centre of mass and its
-    rotation (3, 3), from its principal axes to the axes of the body."""
-
-    mass: float
-    solid: Solid
-    position: np.ndarray
-    rotation: np.ndarray
-
-
-class Assembly(NamedTuple):
-    """A body of several solids, along the body's axes: mass, centre of mass (3,), inertia tensor
-    (3, 3) about it, and the outline (k, 3) of each solid from it."""
-
-    mass: float
-    centre: np.ndarray
-    tensor: np.ndarray
-    outlines: list[np.ndarray]
-
-
-def assemble_solids(parts: Sequence[Part]) -> Assembly:
-    """The rigid body of solids, whose masses and inertia add up, by the parallel axis theorem.
-    Where solids overlap, both masses are there."""
-    masses, positions = (
-        np.array([part.mass for part in parts]),
-        np.array([part.position for part in parts]),
-    )
-    mass = float(masses.sum())
-    centre = masses @ positions / mass
-    tensor = np.zeros((3, 3))
-    outlines = []
-    for part in parts:
-        tensor_of_part = part.rotation @ np.diag(part.solid.inertia) @ part.rotation.T
-        tensor += shifted_inertia(tensor_of_part, part.mass, part.position - centre)
-        outlines.append(part.position - centre + part.solid.outline @ part.rotation.T)
-    return Assembly(mass, centre, 0.5 * (tensor + tensor.T), outlines)
 
 
 def added_mass_of_ellipsoid(semi_axes: ArrayLike, density: float) -> tuple[np.ndarray, np.ndarray]:

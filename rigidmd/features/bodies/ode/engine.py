@@ -14,7 +14,7 @@ from scipy.integrate import DOP853 as Dop853
 from scipy.integrate import Radau
 
 from rigidmd.core.integrators import DOP853, FORMULATIONS, RADAU, RK4, Scheme, Solver
-from rigidmd.core.state import NOW, ORIGIN, WORK, State, no_load
+from rigidmd.core.state import NOW, WORK, State, no_load
 from rigidmd.engines.protocol import Halted, keep_time
 from rigidmd.errors import SimulationError
 from rigidmd.features.bodies.cpu_engine import BodyEngine
@@ -107,7 +107,6 @@ class OdeEngine(BodyEngine):
         solver = _as_solver(integrator)
         self._prepare(state)
         keep_time(state, dt)
-        self._moved = state
         form = _form(solver, state)
         if self.load is None:
             self.load = no_load(state)
@@ -121,11 +120,9 @@ class OdeEngine(BodyEngine):
             form, self.model, self._workspaces, state, self.load, y, stages, dt, until, cursor
         ):
             if status == SINGULAR:
-                raise SingularError(
-                    y[1], state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt
-                )
+                raise SingularError(y[1], state.time_of(state.step[NOW], dt))
             self._handle_status(status, state)
-        read(form, self.model, state, state.time[ORIGIN] + (until - state.step[ORIGIN]) * dt, y)
+        read(form, self.model, state, state.time_of(until, dt), y)
 
     def memory(self) -> dict[str, np.ndarray] | None:
         """As `Engine.memory`. None for Radau, which would resume only within its tolerance."""
@@ -147,7 +144,7 @@ class OdeEngine(BodyEngine):
         begun, y_begin, y, scales = np.split(
             state.extra_variables, [2, 2 + variables, 2 + 2 * variables]
         )
-        end = state.time[ORIGIN] + (until - state.step[ORIGIN]) * dt
+        end = state.time_of(until, dt)
         if self._restart:
             begun[:], y_begin[:] = (state.time[NOW], 0.0), y
             scales[:] = self._scales(solver, state, y)
@@ -178,13 +175,7 @@ class OdeEngine(BodyEngine):
             # restore the last observation: the rates have changed the state
             if self.stop_requested():
                 state.extra_variables[:] = variables_before
-                read(
-                    form,
-                    self.model,
-                    state,
-                    state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt,
-                    y,
-                )
+                read(form, self.model, state, state.time_of(state.step[NOW], dt), y)
                 raise Halted
         if self._dense_output is not None:
             y[:] = self._dense_output(end)
