@@ -7,6 +7,7 @@ from rigidmd.core.display import html as html_of
 from rigidmd.core.statistics import format_with_error
 from rigidmd.features.analysis.curve_figure import curve_figure
 from rigidmd.features.analysis.files import read_results
+from rigidmd.features.analysis.report import HEADERS, row
 from rigidmd.features.analysis.result import AnalysisResult, Value
 from rigidmd.features.view.notebook import drawing_of, framed, sides
 from rigidmd.features.view.page import figure, items, notes, table
@@ -44,10 +45,7 @@ def page_part(record: Record) -> Iterator[str]:
             if value.value is None:
                 left_out.append(f"{value.name}: {value.note}")
                 continue
-            text = format_with_error(value.value, value.error)
-            time = "" if value.correlation_ps is None else f"{value.correlation_ps:.3g}"
-            unit = "" if value.unit == "1" else value.unit
-            rows.append([value.name, text, unit, time, value.note])
+            rows.append([*row(value), value.note])
         for curve in result.curves:
             svg = figure(curve_figure(curve), f"analysis-{curve.file}", curve.label)
             caption = html.escape(f"{result.name}: {curve.label}")
@@ -55,6 +53,6 @@ def page_part(record: Record) -> Iterator[str]:
     if phrases:
         text = html.escape("; ".join(dict.fromkeys(phrases)))
         yield f'<p class="faint">Values ± one standard error, of {text}.</p>'
-    yield table(["", "value", "unit", "correlation time (ps)", "note"], rows, words=True)
+    yield table(["", *HEADERS[1:], "note"], rows, words=True)
     yield f'<div class="plots">{"".join(figures)}</div>' if figures else ""
     yield "<p>Skipped:</p>" + items(left_out) if left_out else ""

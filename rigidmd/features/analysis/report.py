@@ -27,7 +27,7 @@ def results_text(results: Sequence[AnalysisResult], failed: Mapping[str, str]) -
     missing = {value.name: value.note for value in values if value.value is None}
     lines = []
     if known:
-        table = columns_text([HEADERS, *map(_row, known)], left=(0, 1, 2))
+        table = columns_text([HEADERS, *map(row, known)], left=(0, 1, 2))
         lines = ["", *_indented(table.splitlines())]
     lines += _section("Notes:", {value.name: value.note for value in known if value.note})
     lines += _section("No value yet:", missing)
@@ -35,7 +35,8 @@ def results_text(results: Sequence[AnalysisResult], failed: Mapping[str, str]) -
     return lines
 
 
-def _row(value: Value) -> tuple[str, str, str, str]:
+def row(value: Value) -> tuple[str, str, str, str]:
+    """Name, number, unit and correlation time of a value that is known."""
     unit = "" if value.unit == "1" else value.unit
     time = "" if value.correlation_ps is None else f"{value.correlation_ps:.3g}"
     number = format_with_error(not_none(value.value), value.error)

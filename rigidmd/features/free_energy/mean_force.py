@@ -69,17 +69,18 @@ def potential_of_mean_force(
     edges = width * np.arange(np.floor(lowest / width), np.ceil(highest / width) + 1)
     centre = (edges[1:] + edges[:-1]) / 2
     start = np.zeros(len(windows))
-    free, overlap = _free_energies(windows, samples, thermal_energy, start)
+    free, overlap, total = _free_energies(windows, samples, thermal_energy, start)
     notes = _overlap_notes(windows, overlap)
-    counts = np.bincount(_bins_of(np.concatenate(samples), edges), minlength=len(centre))
+    x = np.concatenate(samples)
+    counts = np.bincount(_bins_of(x, edges), minlength=len(centre))
     filled = counts >= LEAST_IN_BIN
-    profile_of_all = _profile(windows, samples, thermal_energy, free, edges, filled)
+    profile_of_all = _profile(x, total, thermal_energy, edges, filled)
     rng = np.random.default_rng(0)
     profiles = []
     for _ in range(RESAMPLED):
         drawn = [rng.choice(some, len(some)) for some in samples]
-        again, _ = _free_energies(windows, drawn, thermal_energy, free)
-        profiles.append(_profile(windows, drawn, thermal_energy, again, edges, filled))
+        _, _, total = _free_energies(windows, drawn, thermal_energy, free)
+        profiles.append(_profile(np.concatenate(drawn), total, thermal_energy, edges, filled))
     # in some a bin is empty
     profiles = [profile for profile in profiles if np.isfinite(profile).all()]
     if len(profiles) < RESAMPLED // 2 or filled.sum() < 2:
@@ -113,19 +114,16 @@ def potential_of_mean_force(
     return AnalysisResult(NAME, ABOUT, [value], [curve], notes)
 
 
-def _biases(windows: Sequence[Window], x: np.ndarray, thermal_energy: float) -> np.ndarray:
-    """Energies (k, n) of the restraints at distances x (n,), in kT."""
-    return np.array([0.5 * w.stiffness * (x - w.distance) ** 2 for w in windows]) / thermal_energy
-
-
 def _free_energies(
     windows: Sequence[Window],
     samples: Sequence[np.ndarray],
     thermal_energy: float,
     start: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Free energies (k,) of the windows in kT, 0 for the first, and their overlap matrix (k, k)."""
-    bias = _biases(windows, np.concatenate(samples), thermal_energy)
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Free energies (k,) of the windows in kT, 0 for the first, their overlap matrix (k, k), and
+    the logarithm (n,) of the inverse weight of each sample."""
+    x = np.concatenate(samples)
+    bias = np.array([0.5 * w.stiffness * (x - w.distance) ** 2 for w in windows]) / thermal_energy
     count = np.array([len(some) for some in samples], float)
 
     def fractions(f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -149,25 +147,20 @@ def _free_energies(
             function, start[1:] - start[0], jac=True, hess=curvature, method="trust-exact"
         )
         free = np.append(0.0, solution.x)
-    part = fractions(free)[1]
-    return free, part @ part.T / count
+    total, part = fractions(free)
+    return free, part @ part.T / count, total
 
 
 def _profile(
-    windows: Sequence[Window],
-    samples: Sequence[np.ndarray],
+    x: np.ndarray,
+    total: np.ndarray,
     thermal_energy: float,
-    free: np.ndarray,
     edges: np.ndarray,
     filled: np.ndarray,
 ) -> np.ndarray:
     """W (b,) in the kept bins, kJ/mol. Not finite where samples are missing."""
-    x = np.concatenate(samples)
-    count = np.array([len(some) for some in samples], float)
-    bias = _biases(windows, x, thermal_energy)
-    weight = -np.asarray(logsumexp(np.log(count)[:, None] + free[:, None] - bias, axis=0))
     log_density = np.full(len(filled), -np.inf)  # densities differ by many orders of magnitude
-    np.logaddexp.at(log_density, _bins_of(x, edges), weight - 2 * np.log(x))
+    np.logaddexp.at(log_density, _bins_of(x, edges), -total - 2 * np.log(x))
     profile = -thermal_energy * log_density[filled]
     with np.errstate(invalid="ignore"):
         return profile - profile[_outer(len(profile))].mean()
