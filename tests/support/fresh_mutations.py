@@ -430,16 +430,6 @@ FRESH: list[Mutation] = [
         ("features/potentials/test_body_pairs.py::test_a_text_has_the_energy_of_all_its_pairs",),
     ),
     Mutation(
-        "F49",
-        "list of pairs of bodies: the strain xz of a cell that leans forgets its part by xy",
-        "features/potentials/poses/pair_list.py",
-        "        xz = (cell[2, 0] - built[2, 0] * xx - built[2, 1] * xy) / built[2, 2]",
-        "        xz = (cell[2, 0] - built[2, 0] * xx) / built[2, 2]",
-        (
-            "features/potentials/test_pair_list.py::test_the_list_is_rebuilt_where_a_strain_of_a_triclinic_cell_exceeds_its_skin",
-        ),
-    ),
-    Mutation(
         "F50",
         "joint fit with a barostat that reads no momenta: the pressure with F²/12m for F²/36m",
         "features/studies/joint_fit.py",

@@ -10,6 +10,7 @@ from rigidmd.compile import chosen_by_type, is_a, kernel
 from rigidmd.compile.simd import inverse_root_and_cube, inverse_square_root
 from rigidmd.features.potentials.sites.custom import CustomPotential
 from rigidmd.forces.neighbors import pair_loop as pairs
+from rigidmd.forces.neighbors.space import nearest_image
 from rigidmd.forces.potentials.coulomb import ReactionField, radial
 from rigidmd.forces.potentials.lennard_jones import LennardJones, ScreenedDispersion
 from rigidmd.forces.potentials.screened_coulomb import (
@@ -131,23 +132,18 @@ def add_guest_energies(potential, core, guest, host, guest_strength, host_streng
     cell (3, 3) : as in `State`; images within half its shortest diagonal element are the nearest
     energy (m,) : u Å²/ps²; becomes inf where two sites are nearer than `core`
     """
-    periodic = cell[0, 0] < inf
     reach = potential.cutoff * potential.cutoff
     least = core * core
     for m in range(len(guest)):
         total = 0.0
         for a in range(guest.shape[1]):
             for b in range(len(host)):
-                dx = guest[m, a, 0] - host[b, 0]
-                dy = guest[m, a, 1] - host[b, 1]
-                dz = guest[m, a, 2] - host[b, 2]
-                if periodic:
-                    along = np.rint(dz / cell[2, 2])
-                    dx, dy = dx - along * cell[2, 0], dy - along * cell[2, 1]
-                    dz = dz - along * cell[2, 2]
-                    along = np.rint(dy / cell[1, 1])
-                    dx, dy = dx - along * cell[1, 0], dy - along * cell[1, 1]
-                    dx = dx - np.rint(dx / cell[0, 0]) * cell[0, 0]
+                dx, dy, dz = nearest_image(
+                    cell,
+                    guest[m, a, 0] - host[b, 0],
+                    guest[m, a, 1] - host[b, 1],
+                    guest[m, a, 2] - host[b, 2],
+                )
                 r2 = dx * dx + dy * dy + dz * dz
                 if r2 < least:
                     total = inf

@@ -6,8 +6,8 @@ import numpy as np
 
 from rigidmd.compile import kernel
 from rigidmd.core.state import State
-from rigidmd.features.potentials.poses.pair_list import nearest_image
 from rigidmd.features.potentials.poses.pairs import BodyPairs, pair_slopes, switch
+from rigidmd.forces.neighbors.space import nearest_image
 
 
 def add_trial_energies(

@@ -8,6 +8,7 @@ import numpy as np
 
 from rigidmd.compile import implements, kernel
 from rigidmd.core.state import OK, State
+from rigidmd.forces.neighbors.space import nearest_image
 from rigidmd.forces.parts import SystemParts
 from rigidmd.forces.terms import add_forces
 from rigidmd.scene.fields import Restraint
@@ -109,18 +110,6 @@ def _faults_in_box(term: DistanceRestraint, parts: SystemParts, where: str) -> l
 
 
 @kernel(inline=True)
-def _nearest(cell, x, y, z):
-    """A vector to the nearest image; see `nearest_images`."""
-    if np.isfinite(cell[0, 0]):
-        turns = np.rint(z / cell[2, 2])
-        x, y, z = x - turns * cell[2, 0], y - turns * cell[2, 1], z - turns * cell[2, 2]
-        turns = np.rint(y / cell[1, 1])
-        x, y = x - turns * cell[1, 0], y - turns * cell[1, 1]
-        x -= np.rint(x / cell[0, 0]) * cell[0, 0]
-    return x, y, z
-
-
-@kernel(inline=True)
 def _centre(state, members, fraction):
     """The centre of mass of a group, its members at the images nearest to the first."""
     first = members[0]
@@ -128,7 +117,7 @@ def _centre(state, members, fraction):
     x, y, z = x0, y0, z0
     for k in range(len(members)):
         m = members[k]
-        dx, dy, dz = _nearest(
+        dx, dy, dz = nearest_image(
             state.cell,
             state.position[m, 0] - x0,
             state.position[m, 1] - y0,
@@ -142,7 +131,7 @@ def _centre(state, members, fraction):
 def _add_distance_restraint(term, state, load, tally):
     ax, ay, az = _centre(state, term.first, term.first_fraction)
     bx, by, bz = _centre(state, term.second, term.second_fraction)
-    arm = _nearest(state.cell, bx - ax, by - ay, bz - az)
+    arm = nearest_image(state.cell, bx - ax, by - ay, bz - az)
     r = sqrt(arm[0] * arm[0] + arm[1] * arm[1] + arm[2] * arm[2])
     away = r - term.distance
     scale = -term.stiffness * away / r if r > 0 else 0.0

@@ -337,7 +337,7 @@ def block_forces(potential, pairs, into, tallies, energies, block):
             sums = (still, still, zero)
             number = 0
             for n in range(first_special, pairs.masked_end[i // 2]):
-                other, image, between = _displacements(
+                other, image, between = displacements(
                     pairs, c, here, neighbors, origin_vector, masked[n, 0]
                 )
                 if tallies is not None:
@@ -364,11 +364,11 @@ def block_forces(potential, pairs, into, tallies, energies, block):
             other = image = np.int32(0)
             between = ((zero, zero, zero, zero), (zero, zero, zero, zero))
             if first_entry <= last:
-                other, image, between = _displacements(
+                other, image, between = displacements(
                     pairs, c, here, neighbors, origin_vector, load_scalar(entries, first_entry)
                 )
             for n in range(first_entry, last + 1):
-                ahead, its_image, after = _displacements(
+                ahead, its_image, after = displacements(
                     pairs, c, here, neighbors, origin_vector, load_scalar(entries, min(n + 1, last))
                 )
                 if tallies is not None:
@@ -430,7 +430,7 @@ def _add_symmetric_virial(tally, virial):
 
 
 @kernel(inline=True)
-def _displacements(pairs, c, here, neighbors, origin_vector, number):
+def displacements(pairs, c, here, neighbors, origin_vector, number):
     """The cluster and the image of an entry, and displacements from its sites, as vectors, to the
     two sites of the row. The displacements are as in `_separation`."""
     local = pairs.clusters.local

@@ -339,7 +339,7 @@ def load_passes(
     blocks = blocks_of(len(state.position))
     passes = [
         Pass("forces and torques on molecules", _load_block, (sites, state, load, force), blocks),
-        Pass("sum energies and virials", _sum_tallies, (sums.tallies, tally), when=TALLIED),
+        Pass("sum energies and virials", sum_tallies, (sums.tallies, tally), when=TALLIED),
     ]
     if isinstance(sites, BodySites):
         offsets = (sites, state, force, sums.virial)
@@ -358,7 +358,7 @@ def virial_buffer() -> np.ndarray:
 
 
 @task()
-def _sum_tallies(arguments, block):
+def sum_tallies(arguments, block):
     """Add the sums of all blocks (blocks, 10) to a tally."""
     tallies, tally = load_arguments(arguments)
     for b in range(len(tallies)):

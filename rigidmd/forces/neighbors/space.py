@@ -111,3 +111,16 @@ def follow_cell(cell, known):
             changed |= known[k, n] != cell[k, n]
             known[k, n] = cell[k, n]
     return changed
+
+
+@kernel(inline=True)
+def nearest_image(cell, x, y, z):
+    """The nearest image of a vector, Å, in a cell (3, 3) with a along x and b in the xy plane; for
+    vectors within half of the shortest edge."""
+    if cell[0, 0] < inf:
+        along = np.rint(z / cell[2, 2])
+        x, y, z = x - along * cell[2, 0], y - along * cell[2, 1], z - along * cell[2, 2]
+        along = np.rint(y / cell[1, 1])
+        x, y = x - along * cell[1, 0], y - along * cell[1, 1]
+        x -= np.rint(x / cell[0, 0]) * cell[0, 0]
+    return x, y, z

@@ -332,3 +332,24 @@ def test_potentials_of_python_are_drawn_like_those_of_scenes():
     text = {"energy": "exp(-r)*a_b**2", "name": "aligning", "axis": "x"}
     (bodies, _) = bodies_of_potentials(build(scene(text), user_code=False))
     assert bodies.potential.axis == "x" and bodies.species.name == "rod"
+
+
+def test_the_list_finds_every_pair_while_bodies_move_and_the_box_changes():
+    """Few bodies in a long box of many bins, hot, with a barostat: the energy at the end is that of
+    all pairs."""
+    npt = {
+        "ensemble": "npt",
+        "temperature_K": 900.0,
+        "pressure_bar": 1.0,
+        "barostat_time_ps": 0.05,
+        "duration_ps": 3.0,
+        "timestep_fs": 5.0,
+    }
+    tables = {"box": {"lengths_A": [34.0, 36.0, 120.0]}, "stages": [npt]}
+    run = simulation(GAY_BERNE, {"rod": 40, "disc": 20}, **tables)
+    results = run.run()
+    _, tallies = run.system.engine().evaluate(results.state)
+    expected = brute_force(run.system, results.state, GAY_BERNE)
+    assert tallies["gay_berne"].energy / KJ_PER_MOL == pytest.approx(expected, rel=1e-10)
+    assert results["potential"][-1] == pytest.approx(expected, rel=1e-9)
+    assert results["volume"][-1] != results["volume"][0]

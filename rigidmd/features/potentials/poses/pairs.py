@@ -9,21 +9,26 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import Pass, kernel, load_arguments, task
-from rigidmd.core.state import TALLY_SIZE, State
-from rigidmd.errors import SimulationError
-from rigidmd.features.potentials.poses.pair_list import (
-    BLOCKS,
-    MUST_BUILD,
-    BodyPairList,
-    empty_list,
-    finish_list,
-    list_pairs,
-    nearest_image,
-    rows_of_block,
-    sort_points,
+from rigidmd.compile import BLOCKS, Pass, kernel, load_arguments, task
+from rigidmd.compile.simd import (
+    align_stack,
+    extract_lane,
+    lanes_of,
+    load_scalar,
+    lowest_bit,
+    mask_bits,
 )
-from rigidmd.forces.neighbors.sites import blocks_of, molecules_of_block
+from rigidmd.core.state import TALLY_SIZE, State
+from rigidmd.forces.neighbors.lists import MASK_BITS, end_of_row, largest_displacement
+from rigidmd.forces.neighbors.pair_loop import PairForces, PairWorkspace, displacements
+from rigidmd.forces.neighbors.sites import (
+    BodySites,
+    CentralSites,
+    blocks_of,
+    molecules_of_block,
+    sum_tallies,
+)
+from rigidmd.forces.neighbors.update import update_pair_list
 from rigidmd.forces.terms import FORCES_ONLY, TALLIED, Evaluation, Setup
 from rigidmd.mechanics.vectors import body_vector, lab_vector
 
@@ -35,8 +40,9 @@ class BodyPairs(NamedTuple):
     """U = sum over pairs of bodies of a formula of their relative pose."""
 
     formula: NamedTuple  # its class chooses the code
+    sites: BodySites | CentralSites  # the reference points of the bodies that take part
     kind: np.ndarray  # (n,) int64 kind of each body; -1 for one that takes no part
-    group: np.ndarray  # (n,) int64 bodies of one group do not interact
+    group: np.ndarray  # (n,) int32 bodies of one group do not interact
     reference: np.ndarray  # (kinds, 3) reference point from the centre of mass, body frame, Å
     frame: np.ndarray  # (kinds, 3, 3) from the coordinates of the model's file to the body frame
     parameters: np.ndarray  # (kinds, kinds, parameters) of the first kind with the second
@@ -47,46 +53,67 @@ class BodyPairs(NamedTuple):
 
     def workspace(self, setup: Setup) -> "BodyPairsWorkspace":
         n = len(self.kind)
-        pairs = empty_list(n, min(setup.skin, LONGEST_SKIN * self.cutoff))
+        points = PairForces(Within(self.cutoff), self.sites, self.group[self.sites.molecule])
+        skin = min(setup.skin, LONGEST_SKIN * self.cutoff)
+        near = points.workspace(setup._replace(skin=skin, dtype=np.float64))
         loads = np.zeros((BLOCKS, n, 6))
-        return BodyPairsWorkspace(self, pairs, loads, np.zeros((BLOCKS, TALLY_SIZE)))
+        sums = BodySums(
+            np.zeros((n, 3)), np.zeros((n, 3, 3)), loads, np.zeros((BLOCKS, TALLY_SIZE))
+        )
+        return BodyPairsWorkspace(self, near, sums)
+
+
+class Within(NamedTuple):
+    """The distance within which points are listed."""
+
+    cutoff: float  # Å
+
+    def for_slots(self, slots: int, dtype: type) -> "Within":
+        return self
+
+
+class BodySums(NamedTuple):
+    arm: np.ndarray  # (n, 3) reference points from the centres of mass, lab frame, Å
+    pose: np.ndarray  # (n, 3, 3) from the coordinates of the model's file to the lab
+    loads: np.ndarray  # (blocks, n, 6) forces on reference points and torques, lab frame
+    tallies: np.ndarray  # (blocks, 10)
 
 
 class BodyPairsWorkspace(NamedTuple):
     term: BodyPairs
-    pairs: BodyPairList
-    loads: np.ndarray  # (blocks, n, 6) forces on reference points and torques, lab frame
-    tallies: np.ndarray  # (blocks, 10)
+    near: PairWorkspace  # its list of the reference points
+    sums: BodySums
 
     def passes(self, into: Evaluation) -> list[Pass]:
-        """Reference points; the list; pairs; sums on bodies."""
-        blocks = blocks_of(len(self.term.kind))
-        plain = (self, into.state, None)
-        tallied = (self, into.state, self.tallies)
+        """Poses; the list; pairs; sums on bodies."""
+        term, near, sums, state = self.term, self.near, self.sums, into.state
+        blocks = blocks_of(len(term.kind))
+        moved = (near.list_code, near.pairs, near.sites, state, into.status)
+        plain = (term, near.pairs, sums, None)
+        tallied = (term, near.pairs, sums, sums.tallies)
         return [
-            Pass("reference points of bodies", _place_points, (self, into.state), blocks),
-            Pass("whether the list is valid", sort_points, (self, into.state, into.status)),
-            Pass("pairs of bodies, if it is not", list_pairs, (self, into.state), BLOCKS),
-            Pass("whether they fit in memory", finish_list, (self, into.status)),
+            Pass("poses of bodies", _place_bodies, (term, sums, state), blocks),
+            Pass("update the neighbour list", update_pair_list, moved),
             Pass("forces of pairs of bodies", _add_pairs, plain, BLOCKS, FORCES_ONLY),
             Pass("forces and energies of pairs of bodies", _add_pairs, tallied, BLOCKS, TALLIED),
-            Pass("sum forces on bodies", _sum_loads, (self, into.state, into.load), blocks),
-            Pass("sum energies", _sum_tallies, (self, into.tally), when=TALLIED),
+            Pass("sum forces on bodies", _sum_loads, (term, sums, state, into.load), blocks),
+            Pass("sum energies", sum_tallies, (sums.tallies, into.tally), when=TALLIED),
         ]
 
+    def with_code(self) -> "BodyPairsWorkspace":
+        return self._replace(near=self.near.with_code())
+
     def with_capacity(self, cell: np.ndarray) -> "BodyPairsWorkspace":
-        if 2 * self.term.cutoff > cell.diagonal().min():
-            raise SimulationError(
-                f"the box has become too small for the cutoff of {self.term.cutoff:g} Å: half its"
-                f" smallest edge is {cell.diagonal().min() / 2:.4g} Å. Begin with a larger box, or"
-                " take a shorter cutoff"
-            )
-        capacity = int(1.1 * self.pairs.needed.max()) + 64
-        if capacity <= self.pairs.entries.shape[1]:
-            return self
-        pairs = self.pairs._replace(entries=np.zeros((BLOCKS, capacity), np.int64))
-        pairs.counters[MUST_BUILD] = 1
-        return self._replace(pairs=pairs)
+        return self._replace(near=self.near.with_capacity(cell))
+
+    def renew_list(self) -> None:
+        self.near.renew_list()
+
+    def checkpoint_arrays(self) -> dict[str, np.ndarray]:
+        return self.near.checkpoint_arrays()
+
+    def restore(self, arrays: dict[str, np.ndarray], skin: float) -> "BodyPairsWorkspace":
+        return self._replace(near=self.near.restore(arrays, skin))
 
 
 def reference_points(term: BodyPairs, state: State) -> tuple[np.ndarray, np.ndarray]:
@@ -107,23 +134,20 @@ def pair_slopes(formula, p, r, a, b):
 
 
 @task()
-def _place_points(arguments, block):
-    work, state = load_arguments(arguments)
-    first, end = molecules_of_block(len(work.term.kind), block, 1)
+def _place_bodies(arguments, block):
+    term, sums, state = load_arguments(arguments)
+    first, end = molecules_of_block(len(term.kind), block, 1)
     for m in range(first, end):
-        x = y = z = 0.0
-        kind = work.term.kind[m]
-        if kind >= 0:
-            offset = work.term.reference[kind]
-            x, y, z = lab_vector(state.rotation[m], offset[0], offset[1], offset[2])
-            frame = work.term.frame[kind]
-            for k in range(3):
-                column = lab_vector(state.rotation[m], frame[0, k], frame[1, k], frame[2, k])
-                for i in range(3):
-                    work.pairs.pose[m, i, k] = column[i]
-        work.pairs.point[m, 0] = state.position[m, 0] + x
-        work.pairs.point[m, 1] = state.position[m, 1] + y
-        work.pairs.point[m, 2] = state.position[m, 2] + z
+        kind = term.kind[m]
+        if kind < 0:
+            continue
+        offset, frame = term.reference[kind], term.frame[kind]
+        arm = lab_vector(state.rotation[m], offset[0], offset[1], offset[2])
+        for k in range(3):
+            sums.arm[m, k] = arm[k]
+            column = lab_vector(state.rotation[m], frame[0, k], frame[1, k], frame[2, k])
+            for i in range(3):
+                sums.pose[m, i, k] = column[i]
 
 
 @kernel(inline=True)
@@ -137,90 +161,104 @@ def switch(term, r):
     return 1 - x**3 * (10 - 15 * x + 6 * x * x), -30 * (x * (1 - x)) ** 2 / width
 
 
-@task()
+@task(count_references=False)
 def _add_pairs(arguments, block):
-    work, state, tallies = load_arguments(arguments)
-    _pairs_of_block(work, state, tallies, block)
+    term, pairs, sums, tallies = load_arguments(arguments)
+    _pairs_of_block(term, pairs, sums, tallies, block)
+
+
+@kernel(inline=True, count_references=False)
+def _pairs_of_block(term, pairs, sums, tallies, block):
+    """Forces and torques from the rows of a block of clusters into the loads of that block, energy
+    and virial into its tally."""
+    align_stack()
+    clusters = pairs.clusters
+    local = clusters.local
+    width = lanes_of(local)
+    sums.loads[block] = 0.0
+    if tallies is not None:
+        tallies[block] = 0.0
+    moved = largest_displacement(pairs)
+    count = len(clusters.origin) // 4
+    of = 0  # the block of the list
+    for c in range(count * block // BLOCKS, count * (block + 1) // BLOCKS):
+        while clusters.bounds[of + 1] <= c:
+            of += 1
+        begins = c == clusters.bounds[of]
+        first_neighbor = 0 if begins else pairs.neighbor_end[c - 1]
+        neighbors = pairs.neighbors[of, first_neighbor:]
+        origin_vector = pairs.origin_vector[of, 3 * first_neighbor :]
+        for i in range(width * c, width * (c + 1), 2):
+            at = 2 * width * c + i
+            here = (
+                (local[at], local[at + width], local[at + 2 * width]),
+                (local[at + 1], local[at + width + 1], local[at + 2 * width + 1]),
+            )
+            row = i // 2
+            begins &= i == width * c
+            special = 0 if begins else pairs.masked_end[row - 1]
+            start = 0 if begins else pairs.row_end[row - 1]
+            for n in range(special - pairs.masked_end[row], end_of_row(pairs, row, moved) - start):
+                # lanes of both sites that interact, as in `PairList.masked`
+                if n < 0:
+                    entry = np.int64(pairs.masked[of, pairs.masked_end[row] + n, 0])
+                    lanes = np.int64(pairs.masked[of, pairs.masked_end[row] + n, 1])
+                else:
+                    entry, lanes = np.int64(load_scalar(pairs.entries[of], start + n)), np.int64(-1)
+                other, _, (a, b) = displacements(pairs, c, here, neighbors, origin_vector, entry)
+                cutoff2 = term.cutoff * term.cutoff
+                lanes &= mask_bits(a[3] < cutoff2) | (mask_bits(b[3] < cutoff2) << MASK_BITS)
+                while lanes != 0:
+                    lane = lowest_bit(lanes)
+                    lanes &= lanes - 1
+                    k = lane & (MASK_BITS - 1)
+                    x, y, z = extract_lane(a[0], k), extract_lane(a[1], k), extract_lane(a[2], k)
+                    if lane >= MASK_BITS:
+                        x, y, z = (
+                            extract_lane(b[0], k),
+                            extract_lane(b[1], k),
+                            extract_lane(b[2], k),
+                        )
+                    first = clusters.order[i + lane // MASK_BITS]
+                    second = clusters.order[width * other + k]
+                    _add_pair(term, sums, tallies, block, first, second, (-x, -y, -z))
 
 
 @kernel(inline=True)
-def _pairs_of_block(work, state, tallies, block):
-    """Forces and torques into the loads of a block, energy and virial into its tally."""
-    term, pairs, cell = work.term, work.pairs, state.cell
-    load = work.loads[block]
-    entries = pairs.entries[block]
-    point = pairs.point
-    first, last = rows_of_block(len(term.kind), block)
-    for m in range(len(load)):
-        for k in range(6):
-            load[m, k] = 0.0
+def _add_pair(term, sums, tallies, block, i, j, r):
+    """One pair of points: r is the vector (3,) from point i to point j, Å."""
+    i, j = term.sites.molecule[i], term.sites.molecule[j]
+    # the kind that is named first is the first body, so that a pair has one energy
+    if (term.kind[i], i) > (term.kind[j], j):
+        i, j, r = j, i, (-r[0], -r[1], -r[2])
+    energy, slope, torque, torque_of_other = pair_slopes(
+        term.formula, term.parameters[term.kind[i], term.kind[j]], r, sums.pose[i], sums.pose[j]
+    )
+    distance = sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
+    factor, change = switch(term, distance)
+    along = change * energy / distance
+    load = sums.loads[block]
+    for k in range(3):
+        force = factor * slope[k] + along * r[k]
+        load[i, k] += force
+        load[j, k] -= force
+        load[i, 3 + k] += factor * torque[k]
+        load[j, 3 + k] += factor * torque_of_other[k]
+        if tallies is not None:
+            # between centres of mass: F on the other body (x) its position from the first
+            for m in range(3):
+                centre = r[m] - sums.arm[j, m] + sums.arm[i, m]
+                tallies[block, 1 + 3 * k + m] -= force * centre
     if tallies is not None:
-        tallies[block] = 0.0
-    n = 0
-    for i in range(first, last):
-        while n < pairs.end[i]:
-            j = entries[n]
-            n += 1
-            x, y, z = nearest_image(
-                cell,
-                point[j, 0] - point[i, 0],
-                point[j, 1] - point[i, 1],
-                point[j, 2] - point[i, 2],
-            )
-            r = sqrt(x * x + y * y + z * z)
-            if r >= term.cutoff:
-                continue
-            # the kind that is named first is the first body, so that a pair has one energy
-            if term.kind[i] <= term.kind[j]:
-                one, other = i, j
-            else:
-                one, other = j, i
-                x, y, z = -x, -y, -z
-            energy, slope, torque, torque_of_other = pair_slopes(
-                term.formula,
-                term.parameters[term.kind[one], term.kind[other]],
-                (x, y, z),
-                pairs.pose[one],
-                pairs.pose[other],
-            )
-            factor, change = switch(term, r)
-            along = change * energy / r
-            force = (
-                factor * slope[0] + along * x,
-                factor * slope[1] + along * y,
-                factor * slope[2] + along * z,
-            )
-            for k in range(3):
-                load[one, k] += force[k]
-                load[other, k] -= force[k]
-                load[one, 3 + k] += factor * torque[k]
-                load[other, 3 + k] += factor * torque_of_other[k]
-            if tallies is not None:
-                tally = tallies[block]
-                tally[0] += factor * energy
-                # between centres of mass: F on the other body (x) its position from the first
-                centre = (
-                    x
-                    - (point[other, 0] - state.position[other, 0])
-                    + (point[one, 0] - state.position[one, 0]),
-                    y
-                    - (point[other, 1] - state.position[other, 1])
-                    + (point[one, 1] - state.position[one, 1]),
-                    z
-                    - (point[other, 2] - state.position[other, 2])
-                    + (point[one, 2] - state.position[one, 2]),
-                )
-                for k in range(3):
-                    for component in range(3):
-                        tally[1 + 3 * k + component] -= force[k] * centre[component]
+        tallies[block, 0] += factor * energy
 
 
 @task()
 def _sum_loads(arguments, block):
     """Forces on reference points and torques as forces on centres of mass and torques about
     them."""
-    work, state, load = load_arguments(arguments)
-    term, loads = work.term, work.loads
+    term, sums, state, load = load_arguments(arguments)
+    loads = sums.loads
     first, end = molecules_of_block(len(term.kind), block, 1)
     for m in range(first, end):
         kind = term.kind[m]
@@ -245,11 +283,3 @@ def _sum_loads(arguments, block):
         load.torque_body[m, 0] += vx + y * uz - z * uy
         load.torque_body[m, 1] += vy + z * ux - x * uz
         load.torque_body[m, 2] += vz + x * uy - y * ux
-
-
-@task()
-def _sum_tallies(arguments, block):
-    work, tally = load_arguments(arguments)
-    for b in range(BLOCKS):
-        for k in range(len(tally)):
-            tally[k] += work.tallies[b, k]

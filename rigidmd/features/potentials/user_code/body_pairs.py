@@ -27,6 +27,7 @@ from rigidmd.features.potentials.user_code.cutoffs import (
     start_distances,
 )
 from rigidmd.features.potentials.user_code.force import BoundTerm
+from rigidmd.forces.neighbors.sites import sites_of
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.validation import not_none
@@ -239,12 +240,14 @@ def bind_body_pairs(potential: BodyPairPotential, system: System) -> BoundTerm:
     kind = of_species[system.model.species]
     body = np.arange(len(kind))
     frozen = (system.model.inverse_mass == 0)[system.model.species]
-    references = [reference_of(potential, m) for m in acting]
+    reference = np.array([reference_of(potential, m) for m in acting], float).reshape(-1, 3)
+    points = [reference[k : k + 1] if k >= 0 else reference[:0] for k in of_species.tolist()]
     term = BodyPairs(
         formula=formula.kind(),
+        sites=sites_of(system.model.species, points, system.model.inverse_inertia),
         kind=kind,
-        group=np.where(frozen, len(body), body),
-        reference=np.array(references, float).reshape(-1, 3),
+        group=np.where(frozen, len(body), body).astype(np.int32),
+        reference=reference,
         frame=np.ascontiguousarray([m.axes.T for m in acting]),
         parameters=rows,
         switch_start=float(start),
