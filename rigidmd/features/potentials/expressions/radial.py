@@ -123,7 +123,7 @@ class Radial:
                     uses_root |= n % 2 == 1
         if uses_root := uses_root or self.r in in_order(outputs, names):
             lines.insert(0, "r = r2 * inverse1")
-        more, values = code_of(outputs, names)
+        more, values = code_of(outputs, names, fused=True)
         return lines + more, values, uses_root
 
 

@@ -5,6 +5,7 @@ lines of Python, which are compiled.
 """
 
 import math
+from collections import Counter
 from collections.abc import Callable, Container, Mapping, Sequence
 from types import ModuleType
 
@@ -82,22 +83,35 @@ def in_order(outputs: Sequence[Traced], known: Container[int] = ()) -> list[Trac
 
 
 def code_of(
-    outputs: Sequence[Number], known: Mapping[int, str] | None = None
+    outputs: Sequence[Number], known: Mapping[int, str] | None = None, *, fused: bool = False
 ) -> tuple[list[str], list[str]]:
     """Lines that compute the nodes, and the text of each output, a node or a number.
 
-    known : text of the nodes that are not computed here
+    known : text of the nodes that are not computed here; fused : write a product in the expression
+    with the sum to which alone it is added, so that vectors have one multiply-add for both
     """
     nodes = [output for output in outputs if isinstance(output, Traced)]
     names: dict[int, str] = dict(known or {})
     lines: list[str] = []
-    for node in in_order(nodes, names):
+    needed = in_order(nodes, names)
+    uses = Counter(part.index for node in needed for part in node.inner)
+    uses.update(node.index for node in nodes)
+    terms = {
+        part.index
+        for node in needed
+        if fused and node.kind in ("add", "subtract")
+        for part in node.inner
+        if part.kind == "multiply" and uses[part.index] == 1
+    }
+    for node in needed:
         if node.index in names:
             continue
         if node.kind == "leaf":
             names[node.index] = node.parts[0]
         elif node.kind == "constant":
             names[node.index] = repr(node.parts[0])
+        elif node.index in terms:
+            names[node.index] = _expression(node, names)
         else:
             names[node.index] = f"v{node.index}"
             lines.append(f"v{node.index} = {_expression(node, names)}")
