@@ -25,7 +25,7 @@ from numba.extending import NativeValue, intrinsic, models, register_model, type
 from rigidmd.compile import thread_pool
 from rigidmd.compile.cache import is_persistent, lock_in_cache
 from rigidmd.compile.kernels import NotStored, chosen_by_type, compile_callback, compiler_options
-from rigidmd.compile.machine import MOST_THREADS, cast_pointer, pointer_to
+from rigidmd.compile.machine import MOST_THREADS, POINTER, cast_pointer
 from rigidmd.compile.records import (
     NumbaStruct,
     by_reference,
@@ -255,7 +255,7 @@ def address_of(typing, code, name, task_arguments):
 
     def emit(context, builder, signature, arguments):
         word = ir.IntType(64)
-        table = builder.inttoptr(arguments[0], pointer_to(word))
+        table = builder.inttoptr(arguments[0], POINTER)
         return builder.load(builder.gep(table, [word(index)], source_etype=word), typ=word)
 
     return types.intp(code, name, task_arguments), emit

@@ -215,9 +215,6 @@ class LinkedLibrary(JITCodeLibrary):
     """
 
     def _optimize_functions(self, ll_module):
-        if not hasattr(FunctionPassManager, "add_sroa_pass"):  # llvmlite before 0.45
-            super()._optimize_functions(ll_module)
-            return
         ll_module.data_layout = self._codegen._data_layout
         builder = create_pass_builder(self._codegen._tm, create_pipeline_tuning_options())
         for function in ll_module.functions:  # only the passes of Numba that make the code smaller

@@ -2,26 +2,19 @@
 work, and pointers.
 
 LLVM has only opaque pointers, and llvmlite is removing typed ones. The pointers of Numba are still
-typed, and llvmlite 0.44, the oldest one supported, has an LLVM that needs typed pointers.
+typed.
 """
 
 import os
 
-import llvmlite
 import numba
 from llvmlite import binding, ir
 from numba.core.registry import cpu_target
 
 from rigidmd.errors import SettingError
 
-#: Whether LLVM accepts opaque pointers. llvmlite has this attribute up to version 0.44, where the
-#: default is False.
-OPAQUE: bool = getattr(llvmlite, "opaque_pointers_enabled", True)
-
-
-def pointer_to(kind: ir.Type) -> ir.PointerType:
-    """The type of pointers to a type."""
-    return ir.PointerType() if OPAQUE else ir.PointerType(kind)
+#: The type of pointers.
+POINTER = ir.PointerType()
 
 
 def cast_pointer(builder, pointer, kind: ir.Type):
@@ -38,12 +31,7 @@ def field_address(builder, pointer, struct: ir.Type, index: int):
     """The address of a field of a struct in memory."""
     pointer = cast_pointer(builder, pointer, struct)
     places = [ir.IntType(32)(0), ir.IntType(32)(index)]
-    address = builder.gep(pointer, places, source_etype=struct)
-    if not getattr(
-        address.type, "is_opaque", True
-    ):  # llvmlite 0.44 gives it the type of the struct's address
-        address.type = ir.PointerType(struct.elements[index])
-    return address
+    return builder.gep(pointer, places, source_etype=struct)
 
 
 class _FunctionPointer(ir.instructions.CastInstr):
@@ -55,9 +43,8 @@ class _FunctionPointer(ir.instructions.CastInstr):
 
 def function_at(builder, address, function_type: ir.FunctionType):
     """The function at an address, an integer."""
-    pointer = builder.inttoptr(address, pointer_to(function_type))
-    if OPAQUE:
-        pointer.__class__, pointer.function_type = _FunctionPointer, function_type
+    pointer = builder.inttoptr(address, POINTER)
+    pointer.__class__, pointer.function_type = _FunctionPointer, function_type
     return pointer
 
 
@@ -99,7 +86,7 @@ def _widest() -> int:
     """
     module = ir.Module()
     vector = ir.VectorType(ir.IntType(32), 16)
-    add = ir.Function(module, ir.FunctionType(ir.VoidType(), [pointer_to(vector)]), "add")
+    add = ir.Function(module, ir.FunctionType(ir.VoidType(), [POINTER]), "add")
     builder = ir.IRBuilder(add.append_basic_block())
     value = builder.load(add.args[0], typ=vector)
     builder.store(builder.add(value, value), add.args[0])

@@ -36,7 +36,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from rigidmd.compile.kernels import compile_callback, compiler_options, kernel
-from rigidmd.compile.machine import IS_X86, MOST_BLOCKS, MOST_THREADS, function_at, pointer_to
+from rigidmd.compile.machine import IS_X86, MOST_BLOCKS, MOST_THREADS, POINTER, function_at
 
 INT64 = ir.IntType(64)
 # Indices of 64-bit cells in the memory of the pool. A cache line has 8; different threads write to
@@ -86,7 +86,7 @@ def _on_cell(emit_on, *values, result=types.int64):
 
     def emit(context, builder, signature, arguments):
         address = builder.add(arguments[0], builder.mul(arguments[1], INT64(8)))
-        return emit_on(builder, builder.inttoptr(address, pointer_to(INT64)), *arguments[2:])
+        return emit_on(builder, builder.inttoptr(address, POINTER), *arguments[2:])
 
     return result(types.intp, types.intp, *(types.int64 for _ in values)), emit
 
