@@ -39,7 +39,7 @@ ATMOSPHERE_PA, TO_ATMOSPHERE = 101325.0, 0.03
 COLDEST_LIQUID = 100.0  # K, of water that starts without a file
 
 
-class Quantity(NamedTuple):
+class PlausibleRange(NamedTuple):
     """Plausible values of a quantity, and the likely cause if a value is smaller or larger."""
 
     unit: str
@@ -65,28 +65,28 @@ class Quantity(NamedTuple):
 
 
 PLAUSIBLE = {
-    "nearest distance": Quantity(
+    "nearest distance": PlausibleRange(
         "Å", 0.5, 15.0, "are the positions in nm?", "are the positions in pm?"
     ),
-    "largest sigma_A": Quantity("Å", 0.9, 15.0, "is it in nm?", "is it in pm?"),
-    "largest epsilon": Quantity("kJ/mol", 0.0, 40.0, "", "is it in J/mol or in K?"),
-    "charge_e": Quantity("e", 1e-6, 10.0, "is it in coulomb?", "is it in another unit?"),
-    "mass_u": Quantity("u", 0.1, 1e4, "is it in kg or g?", "is it in another unit?"),
-    "pressure_bar": Quantity("bar", 0.0, 5e4, "", "is it in Pa?"),
-    "electric_V_per_nm": Quantity("V/nm", 0.0, 100.0, "", "is it in V/m?"),
-    "gravity": Quantity("m/s²", 0.0, 500.0, "", "is it in cm/s²?"),
-    "angles_deg": Quantity(
+    "largest sigma_A": PlausibleRange("Å", 0.9, 15.0, "is it in nm?", "is it in pm?"),
+    "largest epsilon": PlausibleRange("kJ/mol", 0.0, 40.0, "", "is it in J/mol or in K?"),
+    "charge_e": PlausibleRange("e", 1e-6, 10.0, "is it in coulomb?", "is it in another unit?"),
+    "mass_u": PlausibleRange("u", 0.1, 1e4, "is it in kg or g?", "is it in another unit?"),
+    "pressure_bar": PlausibleRange("bar", 0.0, 5e4, "", "is it in Pa?"),
+    "electric_V_per_nm": PlausibleRange("V/nm", 0.0, 100.0, "", "is it in V/m?"),
+    "gravity": PlausibleRange("m/s²", 0.0, 500.0, "", "is it in cm/s²?"),
+    "angles_deg": PlausibleRange(
         "°", 10.0, 170.0, "are they in radians?", "do three edges really lie in one plane?"
     ),
 }
 
 
 REFUSED = {
-    "density": Quantity(
+    "density": PlausibleRange(
         "g/cm³", 0.0, 25.0, "", "is it in kg/m³, or an edge in nm?", heaviest_site=300.0
     ),
     # no step at any temperature follows the forces of such charges, and no grid resolves them
-    "charge_e": Quantity("e", 0.0, 1e3, "", "is it in another unit?"),
+    "charge_e": PlausibleRange("e", 0.0, 1e3, "", "is it in another unit?"),
 }
 
 
