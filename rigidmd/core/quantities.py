@@ -6,6 +6,7 @@ read this table.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from math import hypot, inf, isfinite, nan
 
 from rigidmd.core.state import HEAT, NOW, WORK
@@ -141,19 +142,20 @@ def _squares(name: str) -> Callable[..., float]:
     return of
 
 
+#: A row whose mean has no meaning.
+_unaveraged = partial(Quantity, is_averaged=False)
 #: Of all scenes, in the order of log.csv, whose first columns are those of OpenMM.
 QUANTITIES = {
     row.name: row
     for row in (
-        Quantity(
+        _unaveraged(
             "step",
             "Step",
             "1",
             "steps since the start",
             lambda o: int(o.state.step[NOW]),
-            is_averaged=False,
         ),
-        Quantity("time", "Time (ps)", "ps", "time since the start", is_averaged=False),
+        _unaveraged("time", "Time (ps)", "ps", "time since the start"),
         Quantity(
             "potential",
             "Potential Energy (kJ/mole)",
@@ -210,7 +212,7 @@ QUANTITIES = {
             of_box=True,
             mean=Mean("density{}_g_cm3", "density", digits=4, order=5, is_main=True),
         ),
-        Quantity("stage_name", "Stage", "", "name of the stage", is_averaged=False),
+        _unaveraged("stage_name", "Stage", "", "name of the stage"),
         Quantity(
             "temperature_translation",
             "T_trans (K)",
@@ -256,13 +258,12 @@ QUANTITIES = {
                 is_main=True,
             ),
         ),
-        Quantity(
+        _unaveraged(
             "drift",
             "Drift (kJ/mole)",
             "kJ/mol",
             "change of `conserved` since the stage began",
             lambda o: o.conserved - (o.conserved if o.origin is None else o.origin),
-            is_averaged=False,
             mean=Mean(
                 "drift{}_kT_ns_per_degree_of_freedom",
                 unit="kT/ns per degree of freedom",
@@ -273,21 +274,19 @@ QUANTITIES = {
                 is_main=True,
             ),
         ),
-        Quantity(
+        _unaveraged(
             "momentum",
             "Momentum (u A/ps)",
             "u Å/ps",
             "size of the total momentum",
             lambda o: hypot(*o.sums.momentum.tolist()),
-            is_averaged=False,
         ),
-        Quantity(
+        _unaveraged(
             "orthogonality_error",
             "Orthogonality error",
             "1",
             "largest entry of abs(QᵀQ - 1)",
             lambda o: o.sums.orthogonality_error,
-            is_averaged=False,
         ),
         _edge("a", 0),
         _edge("b", 1),
@@ -295,47 +294,42 @@ QUANTITIES = {
         _angle("alpha", "b and c", 3),
         _angle("beta", "c and a", 4),
         _angle("gamma", "a and b", 5),
-        Quantity(
+        _unaveraged(
             "heat",
             "Heat (kJ/mole)",
             "kJ/mol",
             "heat that thermostats have added since the start",
             lambda o: float(o.ledger[HEAT]),
-            is_averaged=False,
         ),
-        Quantity(
+        _unaveraged(
             "work",
             "Work (kJ/mole)",
             "kJ/mol",
             "work of barostats, drives and minimisations so far",
             lambda o: float(o.ledger[WORK]),
-            is_averaged=False,
         ),
         _pressure("xx", "molecular pressure tensor, symmetric part"),
         *(_pressure(axes, f"the same, {axes}") for axes in ("yy", "zz", "xy", "xz", "yz")),
-        Quantity(
+        _unaveraged(
             "conserved",
             "",
             "kJ/mol",
             "energy less heat, work and the energy of removed momentum",
-            is_averaged=False,
         ),
-        Quantity("stage", "", "1", "index of the stage, from 0", is_averaged=False),
-        Quantity(
+        _unaveraged("stage", "", "1", "index of the stage, from 0"),
+        _unaveraged(
             "force_squares",
             "F^2/m (kJ/mole/ps^2)",
             "kJ/mol/ps²",
             "sum of F²/m of all molecules",
             _squares("force"),
-            is_averaged=False,
         ),
-        Quantity(
+        _unaveraged(
             "torque_squares",
             "n^2/I (kJ/mole/ps^2)",
             "kJ/mol/ps²",
             "the same of torques n",
             _squares("torque"),
-            is_averaged=False,
         ),
     )
 }
