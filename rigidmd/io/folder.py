@@ -14,8 +14,6 @@ from rigidmd.errors import OutputError, option, resume_command
 #: Names of files of a run. The scene names trajectory and topology.
 SCENE = "scene.toml"
 LOG = "log.csv"
-MOTION = "motion.csv"
-MOTION_NPZ = "motion.npz"
 FINAL, LAST_GOOD, SUMMARY = "final.npz", "last_good_state.npz", "summary.json"
 CHECKPOINT, PREVIOUS = "checkpoint.npz", "checkpoint_previous.npz"
 #: Marks the folder of a run and lists the files that the run may write, one per line. `force` may
@@ -180,17 +178,19 @@ class FolderLock:
         self.release()
 
 
-def never_began(folder: Path) -> bool:
+def never_began(folder: Path, samples_file: str) -> bool:
     """Whether a run ended before its first checkpoint, so that nothing is lost if it is started
     again."""
-    ended = (CHECKPOINT, PREVIOUS, FINAL, LAST_GOOD, SUMMARY, MOTION)
+    ended = (CHECKPOINT, PREVIOUS, FINAL, LAST_GOOD, SUMMARY)
     if CHECKPOINT not in written_by_runs(folder) or any((folder / name).exists() for name in ended):
         return False
-    log = folder / LOG
-    with writing(log, "read"):
-        # its header, its start
-        is_short = not unreadable_reason(log, 1e5) and len(log.read_bytes().splitlines()) <= 2
-    return is_short or not log.exists()
+    samples = folder / samples_file
+    with writing(samples, "read"):
+        # their header, the start
+        is_short = (
+            not unreadable_reason(samples, 1e5) and len(samples.read_bytes().splitlines()) <= 2
+        )
+    return is_short or not samples.exists()
 
 
 class RunMark:

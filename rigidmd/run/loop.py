@@ -32,6 +32,7 @@ from rigidmd.io.folder import CHECKPOINT, PREVIOUS, SUMMARY, FolderLock
 from rigidmd.io.progress import progress_of
 from rigidmd.io.write import write_json
 from rigidmd.run import resume
+from rigidmd.run.kind import kind_of
 from rigidmd.run.observers import GrowingFile, Moment, Observer
 from rigidmd.run.results import Results
 from rigidmd.run.schedule import (
@@ -354,7 +355,8 @@ class RunLoop:
     def _read_checkpoint(self, folder: Path) -> tuple[Checkpoint | None, bool]:
         """The checkpoint to resume from, None if the run has to start, and whether the files of the
         folder stay."""
-        if run_folder.is_empty(folder) or run_folder.never_began(folder):
+        samples_file = kind_of(self._simulation.scene).samples_file
+        if run_folder.is_empty(folder) or run_folder.never_began(folder, samples_file):
             self._simulation._announce(f"{folder} holds no run yet: beginning it")
             return None, not run_folder.is_empty(folder)
         for path in folder.iterdir():

@@ -7,8 +7,7 @@ import numpy as np
 
 from rigidmd.core.toml import Json
 from rigidmd.feature import Feature
-from rigidmd.features.bodies.keys.body import BodyScene
-from rigidmd.io.folder import MOTION
+from rigidmd.features.bodies.keys.body import MOTION, BodyScene
 from rigidmd.run.kind import Kind
 
 if TYPE_CHECKING:

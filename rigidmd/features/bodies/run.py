@@ -16,6 +16,7 @@ from rigidmd.engines.protocol import NotFiniteError
 from rigidmd.engines.samples import MATRIX
 from rigidmd.errors import SimulationError, StructureError
 from rigidmd.features.bodies.assemble import build_body
+from rigidmd.features.bodies.keys.body import MOTION
 from rigidmd.features.bodies.motion import (
     Motion,
     energies_of,
@@ -29,7 +30,6 @@ from rigidmd.features.bodies.summary import summarise_body, summary_text
 from rigidmd.features.bodies.system import BodySystem, Pose
 from rigidmd.formats import format_of
 from rigidmd.io.checkpoint import Checkpoint
-from rigidmd.io.folder import MOTION, MOTION_NPZ
 from rigidmd.io.write import write_columns, write_npz
 from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.run.failed_check import MIN_INERTIA_FRACTION, ROUNDING, FailedCheck
@@ -169,6 +169,9 @@ class BodyWatch(Observer):
         else:
             likely = "timestep_s is too long for this motion, or a force grows without bound"
         return f"{failed}. Likely cause: {likely}. Try {advice}"
+
+
+MOTION_NPZ = "motion.npz"
 
 
 class MotionFiles(Observer):

@@ -6,10 +6,10 @@ import numpy as np
 
 from rigidmd.core.state import State
 from rigidmd.errors import CheckpointError, OutputError
+from rigidmd.features.bodies.keys.body import MOTION
 from rigidmd.features.bodies.motion import COLUMNS, NAMES, motion, states_of
 from rigidmd.features.bodies.system import BodySystem
 from rigidmd.io.checkpoint import latest
-from rigidmd.io.folder import MOTION
 from rigidmd.io.run_files import Columns, read_columns
 
 

@@ -592,5 +592,6 @@ class BodyScene(Scene):
 
 
 SCENE = BodyScene
+MOTION = "motion.csv"  # the file of the samples
 SAMPLES = 2000  # of the motion of a body
 FORMULATION = "matrix"
