@@ -7,8 +7,9 @@ Massless sites that lack a symmetry of the atoms are not distinguished: the orde
 decides, without a note.
 """
 
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Iterator
 from functools import cached_property
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +30,7 @@ LINEAR = 0.01
 #: centre and axis.
 WIDE = 0.4
 MOST_STARTS = 4000  # orientations from which orders are searched
+FIRST_STARTS = 32  # the most likely ones, after which the search may end
 MOST_REFINEMENTS = 10
 FARTHEST = 1e6  # Å, more than any distance within a molecule
 MOST_DISTANCES = 1_000_000  # computed at once
@@ -164,12 +166,16 @@ class Orders:
         """The best order (s,) for a molecule (s, 3) in which no atom deviates by more than a limit,
         Å, or None."""
         centred = points - points.mean(axis=0)
-        orders = self._refined(centred, self._starts(centred, 2 * limit))
-        if len(orders) == 0:
-            return None
-        fit = fit_template(points[orders], self.molecule)
-        square = np.where(fit.deviation <= limit, fit.square, np.inf)
-        return orders[square.argmin()] if np.isfinite(square).any() else None
+        best, least = None, np.inf
+        for starts in self._starts(centred, 2 * limit):
+            orders = self._refined(centred, starts)
+            fit = fit_template(points[orders], self.molecule)
+            square = np.where(fit.deviation <= limit, fit.square, np.inf)
+            if square.min() < least:
+                best, least = orders[square.argmin()], square.min()
+            if np.sqrt(least) <= self._certain:
+                break
+        return best
 
     @cached_property
     def _certain(self) -> float:
@@ -188,7 +194,9 @@ class Orders:
         same = np.arange(len(self.classes))[None]
         if self._is_fixed:
             return same
-        orders = self._refined(self._centred, self._starts(self._centred, 4 * self.limit))
+        starts = self._starts(self._centred, 4 * self.limit)
+        orders = np.concatenate([self._refined(self._centred, rotations) for rotations in starts])
+        orders = np.unique(orders, axis=0)
         fit = fit_template(self._template[orders], self.molecule)
         keeps = (self._parameters[orders] == self._parameters).all(axis=1)
         exact = fit.deviation <= EQUAL_OF_RADIUS * self.molecule.radius
@@ -277,9 +285,9 @@ class Orders:
         starts = np.where(off_axis >= WIDE * off_axis.max(), np.outer(size, size), np.inf)
         return [int(k) for k in np.unravel_index(starts.argmin(), starts.shape)]
 
-    def _starts(self, centred: np.ndarray, slack: float) -> np.ndarray:
+    def _starts(self, centred: np.ndarray, slack: float) -> Iterator[np.ndarray]:
         """Orientations (k, 3, 3) of the template in which its anchors point at atoms (s, 3), whose
-        distances differ by no more than `slack`."""
+        distances differ by no more than `slack`. The most likely ones first."""
         anchors = self._anchors
         radii = np.linalg.norm(self._centred, axis=1)[anchors]
         off = np.abs(np.linalg.norm(centred, axis=1) - radii[:, None])  # (anchors, s)
@@ -294,8 +302,12 @@ class Orders:
             mismatch = np.maximum(np.maximum(off[0][:, None], off[1]), apart).ravel()
             pairs = np.stack(np.unravel_index(np.arange(mismatch.size), apart.shape), axis=1)
         likely = mismatch.argsort(kind="stable")[: np.count_nonzero(mismatch <= slack)]
-        at = centred[pairs[likely[:MOST_STARTS]]]
-        return align(self._centred[anchors], at, np.ones(len(anchors)))
+        likely = likely[:MOST_STARTS]
+        size = max(FIRST_STARTS, MOST_DISTANCES // len(centred) ** 2)
+        for first, last in pairwise([0, *range(FIRST_STARTS, len(likely), size), len(likely)]):
+            if last > first:
+                at = centred[pairs[likely[first:last]]]
+                yield align(self._centred[anchors], at, np.ones(len(anchors)))
 
     def _refined(self, centred: np.ndarray, rotations: np.ndarray) -> np.ndarray:
         """Different orders (k, s) of atoms (s, 3) that orientations of the template lead to."""
