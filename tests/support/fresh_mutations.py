@@ -708,9 +708,9 @@ FRESH: list[Mutation] = [
     Mutation(
         "F81",
         "joint fit: a large chi² scales errors without its root",
-        "features/studies/joint_fit.py",
-        "factor = sqrt(last[0].chi2 / last[0].freedom)",
-        "factor = last[0].chi2 / last[0].freedom",
+        "features/studies/extrapolation.py",
+        "factor = sqrt(fits[-1][0].chi2 / fits[-1][0].freedom)",
+        "factor = fits[-1][0].chi2 / fits[-1][0].freedom",
         (
             "features/studies/test_joint_fit.py::test_means_that_no_fit_describes_make_the_error_of_a_limit_larger",
         ),

@@ -2,6 +2,7 @@
 
 import re
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -83,7 +84,9 @@ def test_a_restrained_distance(entry, box, monkeypatch):
     away = np.linalg.norm(arm) - entry["distance_A"]
     tally = tallies["restraints_0"]
     assert tally.energy == pytest.approx(0.5 * stiffness * away**2, rel=1e-12)
-    assert term.distance_in(state) == pytest.approx(np.linalg.norm(arm), rel=1e-13)
+    assert term.observed_distance(SimpleNamespace(state=state)) == pytest.approx(
+        np.linalg.norm(arm), rel=1e-13
+    )
     assert not load.torque_body.any()
     assert np.abs(load.force.sum(axis=0)).max() < 1e-12 * np.abs(load.force).max()
     h, scale = 1e-5, np.abs(load.force).max()
