@@ -449,8 +449,8 @@ FRESH: list[Mutation] = [
         "F52",
         "potential of mean force: windows count alike, whatever their numbers of samples",
         "features/free_energy/mean_force.py",
-        "    weight = -np.asarray(logsumexp(np.log(count)[:, None] + free[:, None] - bias, axis=0))",
-        "    weight = -np.asarray(logsumexp(free[:, None] - bias, axis=0))",
+        "        terms = np.log(count)[:, None] + f[:, None] - bias",
+        "        terms = f[:, None] - bias",
         ("features/free_energy/test_mean_force.py::test_a_known_potential",),
     ),
     Mutation(
