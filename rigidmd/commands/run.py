@@ -64,6 +64,7 @@ DURATION = (
     writes=True,
 )
 def run(options: Options) -> int:
+    """The command `rigidmd run`."""
     from rigidmd.run.kind import kind_of
 
     scene = read_scene(options)

@@ -51,4 +51,5 @@ def bonds(m: Shape) -> list[tuple[int, int]]:
 
 
 def distance(m: Shape, i: int, j: int) -> float:
+    """The distance of two sites of a molecule, Å."""
     return float(np.linalg.norm(m.positions_body[i] - m.positions_body[j]))

@@ -58,10 +58,12 @@ def summary_text(
 
 
 def as_lines(rows: list[tuple[str, str]]) -> list[str]:
+    """Lines of a report with names and values."""
     return [f"  {name:<16}{value}" for name, value in rows]
 
 
 def last_lines(summary: dict, known: Container[str]) -> list[str]:
+    """Notes that are not in `known`, and whether the run was interrupted."""
     notes = [f"\n  note: {note}" for note in summary["notes"] if note not in known]
     return [
         *notes,
@@ -70,6 +72,7 @@ def last_lines(summary: dict, known: Container[str]) -> list[str]:
 
 
 def orthogonality(summary: dict) -> tuple[str, str]:
+    """The row on the largest error of rotation matrices."""
     error = summary["largest_orthogonality_error"]
     return "orthogonality", f"|QᵀQ - 1| at most {error:.1e}" if error else "exactly 0"
 

@@ -454,6 +454,7 @@ def carried_fluid(scene: BodyScene) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def rotor_of(scene: BodyScene, moments: np.ndarray, added_inertia: np.ndarray, axes: np.ndarray):
+    """The rotor of a body with moments about its axes, and wheels."""
     if not scene.wheels and scene.changing_inertia is None:
         return split_rotor(moments[None])
     changing = scene.changing_inertia
@@ -483,6 +484,7 @@ def _time_function(timed: Timed, values) -> TimeFunction:
 
 
 def frame_of(scene: BodyScene):
+    """The frame of reference of a scene."""
     frame = scene.frame
     if frame is None or (
         frame.angular_velocity_rad_s is None and frame.angular_acceleration_rad_s2 is None
@@ -497,6 +499,7 @@ def frame_of(scene: BodyScene):
 
 
 def resistance_of(scene: BodyScene):
+    """The resistance of bearings and of the fluid of a scene."""
     friction, fluid = scene.friction or Friction(), scene.fluid or Fluid()
     viscous = np.add(friction.viscous_N_m_s, fluid.linear_rotational_resistance_N_m_s)
     of_translation = fluid.linear_resistance_kg_s, fluid.quadratic_resistance_kg_m
@@ -507,6 +510,7 @@ def resistance_of(scene: BodyScene):
 
 
 def terms_of(scene: BodyScene, mass: float, axes: np.ndarray, centre: np.ndarray, displaced: float):
+    """The terms of the forces of a scene."""
     terms = {}
     at_centre = axes.T @ centre
     if scene.gravity is not None:

@@ -135,6 +135,7 @@ def states_of(arrays: Mapping[str, np.ndarray]) -> list[State]:
 
 
 def motion(system: BodySystem, samples: Sequence[State]) -> Motion:
+    """The motion of a body from its states."""
     states = State(**stacked(samples, State._fields[:-1]), extra_variables=np.zeros(0))
     times = states.time[:, NOW]
     position, velocity, rotation, omega = system.motion(times, states)

@@ -427,6 +427,7 @@ def _labels(system: MolecularSystem) -> np.ndarray:
 
 
 def read_frame(path: Path, frame: int, atom_types: dict[str, str] | None = None) -> Atoms:
+    """The molecules of one frame of a GSD file."""
     try:
         with contextlib.closing(GsdReader(path)) as reader:
             snapshot = reader.read(index_of(reader.count, frame))

@@ -314,6 +314,7 @@ def _in_our_units(atoms: Atoms, velocity: np.ndarray | None, units: str, unknown
 def read_dump(
     path: Path, lines: list[str], atom_types: dict[str, str] | None
 ) -> list[Callable[[], Atoms]]:
+    """Readers of the frames of a dump."""
     named = {
         lines[k + 1].strip(): k + 2
         for k, line in enumerate(lines[:-1])

@@ -209,6 +209,7 @@ def last_bits(first: str, second: str) -> int | None:
 
 
 def describe_run_comparison(found: RunComparison) -> str:
+    """The comparison of two runs as text."""
     one, other = found.folders
     rows = [
         (name, [f"{key}: {a} and {b}" for key, (a, b) in unlike.items()] or ["the same"])

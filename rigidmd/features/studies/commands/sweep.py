@@ -159,6 +159,7 @@ def _write_commands(options: Options, manifest: "Manifest") -> None:
 
 
 def run(options: Options, manifest: "Manifest") -> int:
+    """The command `rigidmd sweep`."""
     from concurrent.futures import ThreadPoolExecutor
 
     from rigidmd.features.studies.sweep.points import cluster, run_points
