@@ -57,7 +57,7 @@ def resolve(scene: MolecularScene) -> ResolvedScene:
         rotation=start.rotation if any(m.inertia.any() for m in species) else None,
         cell=start.cell,
     )
-    model = _model_of(species, index, frozen)
+    model = model_of(species, index, frozen)
     parts = SystemParts(scene, species, model, space, state, number, start.basis, None)
     resolved = with_defaults(scene, parts)
     complete, errors = resolved.scene, [*errors, *resolved.errors]
@@ -86,7 +86,7 @@ def _temperature_of(scene: MolecularScene, species: list[Molecule], start: Confi
     return float(squares) / (3 * len(start.species)) / BOLTZMANN
 
 
-def _model_of(species: list[Molecule], index: np.ndarray, frozen: np.ndarray) -> Model:
+def model_of(species: list[Molecule], index: np.ndarray, frozen: np.ndarray) -> Model:
     """The model of molecules (n,) of these species, of which some are frozen."""
     mass = np.array([m.mass for m in species])
     inertia = np.where(frozen[:, None], 0.0, [m.inertia for m in species])

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from rigidmd.assemble.build import field_terms, interactions
+from rigidmd.assemble.resolve import model_of
 from rigidmd.core.state import State, state_of
-from rigidmd.dynamics.model import Model
 from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
@@ -26,9 +26,7 @@ from rigidmd.forces.ewald.direct_sum import SAME_BASIS
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.parts import Grid, SystemParts
 from rigidmd.forces.terms import trait
-from rigidmd.mechanics.free_rotor import NoRotor, split_rotor
 from rigidmd.scene.models import Molecule, load_model, read_molecule
-from rigidmd.scene.molecules import missing_user_code
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 if TYPE_CHECKING:
@@ -196,27 +194,16 @@ class Guest:
 def _reassembled(system: System, host: np.ndarray, added: list[Molecule]) -> System:
     """The system of some of its molecules, with added ones at the end, which move."""
     species = [*system.species, *added]
-    old = system.model
     new = np.arange(len(system.species), len(species))
-    mass = np.append(old.mass, [m.mass for m in added])
-    inertia = np.vstack([old.inertia, *(m.inertia for m in added)])
-    rotor = split_rotor(inertia)
-    model = Model(
-        np.append(old.species[host], new).astype(np.int32),
-        mass,
-        np.append(old.inverse_mass, [1 / m.mass for m in added]),
-        inertia,
-        rotor.inverse_inertia,
-        rotor if inertia.any() else NoRotor(),
-    )
+    frozen = np.append(system.model.inverse_mass == 0, np.zeros(len(added), bool))
+    model = model_of(species, np.append(system.model.species[host], new), frozen)
     state = _selected(system.state, host)
-    rotates = len(system.state.rotation) > 0 or bool(inertia.any())  # also of frozen molecules
+    rotates = len(system.state.rotation) > 0 or bool(
+        model.inertia.any()
+    )  # also of frozen molecules
     for _ in added:
         state = _with_trial(state, np.zeros(3), np.eye(3), rotates=rotates)
     scene = system.scene
-    if scene.from_python != scene.user_code.names:
-        missing = missing_user_code(scene.from_python, scene.user_code.names)
-        raise SceneError(scene.source, [missing])
     if scene.forces.electrostatics is None:  # only the trial molecule has charges
         forces = scene.forces.model_copy(update={"electrostatics": "none"})
         scene = scene.model_copy(update={"forces": forces})

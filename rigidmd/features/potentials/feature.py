@@ -7,13 +7,11 @@ from pathlib import Path
 
 from rigidmd.core.state import State
 from rigidmd.engines.system import System
-from rigidmd.errors import SceneError
 from rigidmd.feature import Feature
 from rigidmd.features.potentials.extra import UserExtra, body_pairs_of, with_extra
 from rigidmd.features.potentials.user_code import trust
 from rigidmd.forces.parts import SystemParts
 from rigidmd.scene import Scene
-from rigidmd.scene.molecules import missing_user_code
 
 
 class Potentials(Feature):
@@ -23,9 +21,6 @@ class Potentials(Feature):
             from rigidmd.features.potentials.user_code.body_pairs import potentials_of_stored_run
 
             return with_extra(system, UserExtra(body_pairs=potentials_of_stored_run(scene)))
-        if scene.from_python != scene.user_code.names:
-            missing = missing_user_code(scene.from_python, scene.user_code.names)
-            raise SceneError(scene.source, [missing])
         from rigidmd.features.potentials.user_code.binding import with_user_code
 
         return with_user_code(system)

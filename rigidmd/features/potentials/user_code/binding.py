@@ -40,7 +40,7 @@ from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.parts import sum_of_tails
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.added_forces import AddedForce
-from rigidmd.scene.molecules import name_of
+from rigidmd.scene.molecules import missing_user_code, name_of
 from rigidmd.scene.validation import not_none
 
 #: Names that a force cannot have, and what they are.
@@ -131,6 +131,9 @@ def with_user_code(system: System, *, is_start: bool = True) -> System:
     is_start : whether it starts in its state, in which energies must be finite
     """
     scene, (added, thermostat) = system.scene, system.scene.user_code
+    if scene.from_python != scene.user_code.names:
+        missing = missing_user_code(scene.from_python, scene.user_code.names)
+        raise SceneError(scene.source, [missing])
     in_stages = cast("ThermostatOfStages | None", thermostat)  # checked below
     forces = [*custom_forces(scene), *added]
     force_names = [*(entry.label for entry in scene.forces.added.values()), *map(name_of, added)]
