@@ -18,8 +18,9 @@ from rigidmd.scene import Scene
 def arrays_of(moment):
     """All arrays that a moment gives."""
     seen = moment.observation
-    lazy = [getattr(seen, name, None) for name in ("force", "torque_body")]  # of molecules
-    given = [moment.site_positions, *moment.state, *seen, *lazy]
+    fields = seen if isinstance(seen, tuple) else vars(seen).values()
+    lazy = [getattr(seen, name, None) for name in ("force", "torque_body", "momentum")]
+    given = [moment.site_positions, *moment.state, *fields, *lazy]
     return [part for part in given if isinstance(part, np.ndarray)]
 
 
