@@ -157,6 +157,9 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
         """Read the record of a checkpoint. Raises ValueError or KeyError."""
         values = restored(kept, self.record_type.types(), self.scene.rows)
         self.record = self.record_type(**values)
+        position, count = self.record.position, len(self.durations())
+        if position.segment >= count or len(position.computing) != position.segment:
+            raise ValueError(f"it is of stage {position.segment} of {count}")
 
     def is_replaced(self, moment: Moment) -> bool:
         """Whether the current moment is followed by another one of the same time."""

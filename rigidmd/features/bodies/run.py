@@ -68,6 +68,11 @@ class Sampler(Observer):
     def stacked(self, arrays: dict[str, np.ndarray]) -> None:
         self.states = states_of(arrays)
 
+    def resume(self, run: "Simulation", kept: Checkpoint) -> None:
+        super().resume(run, kept)
+        for state in self.states:
+            state_from(state._asdict(), run._part.state, exact=False)
+
     def see(self, moment: Moment) -> None:
         self.states.append(moment.state)
 
