@@ -173,14 +173,15 @@ class Traced:
         """NumPy functions for single numbers and arrays."""
         if method != "__call__" or options:
             return NotImplemented
-        if any(isinstance(value, np.ndarray) for value in inputs):
+        numbers = [value for value in inputs if not isinstance(value, np.ndarray)]
+        if len(numbers) < len(inputs):
             arrays = [_as_objects(value) for value in inputs]
             return _each(lambda *values: ufunc(*values), *arrays)
         name = ufunc.__name__
         if name in _OPERATORS:
-            return _OPERATORS[name](*map(self._other, inputs))
+            return _OPERATORS[name](*map(self._other, numbers))
         if name in ("maximum", "minimum"):
-            first, second = map(self._other, inputs)
+            first, second = map(self._other, numbers)
             is_less = first < second
             if name == "maximum":
                 return choose(is_less, second, first)
