@@ -3,8 +3,6 @@
 Unique names of sites fix the order, as in most .gro and .pdb files. An order is searched for files
 that have elements only (.xyz, .cif, .gen, POSCAR), for names that several atoms share, and for
 molecules that symmetry or bonding distances put together, whose atoms are in another order in each.
-Massless sites that lack a symmetry of the atoms are not distinguished: the order of the file
-decides, without a note.
 """
 
 from collections.abc import Hashable, Iterable, Iterator
@@ -32,7 +30,6 @@ WIDE = 0.4
 MOST_STARTS = 4000  # orientations from which orders are searched
 FIRST_STARTS = 32  # the most likely ones, after which the search may end
 MOST_REFINEMENTS = 10
-FARTHEST = 1e6  # Å, more than any distance within a molecule
 MOST_DISTANCES = 1_000_000  # computed at once
 
 
@@ -165,14 +162,16 @@ class Orders:
     def search(self, points: np.ndarray, limit: float) -> np.ndarray | None:
         """The best order (s,) for a molecule (s, 3) in which no atom deviates by more than a limit,
         Å, or None."""
+        best = None
+        least = np.inf
         centred = points - points.mean(axis=0)
-        best, least = None, np.inf
         for starts in self._starts(centred, 2 * limit):
             orders = self._refined(centred, starts)
             fit = fit_template(points[orders], self.molecule)
             square = np.where(fit.deviation <= limit, fit.square, np.inf)
             if square.min() < least:
-                best, least = orders[square.argmin()], square.min()
+                best = orders[square.argmin()]
+                least = square.min()
             if np.sqrt(least) <= self._certain:
                 break
         return best
@@ -191,34 +190,68 @@ class Orders:
         """Orders (k, s) of the sites in which the template fits itself twice as far off as the
         limit, the given one first, without those that change nothing: exact symmetries under which
         parameters are the same."""
-        same = np.arange(len(self.classes))[None]
+        count = len(self.classes)
+        same = np.arange(count)[None]
         if self._is_fixed:
             return same
         starts = self._starts(self._centred, 4 * self.limit)
         orders = np.concatenate([self._refined(self._centred, rotations) for rotations in starts])
         orders = np.unique(orders, axis=0)
         fit = fit_template(self._template[orders], self.molecule)
-        keeps = (self._parameters[orders] == self._parameters).all(axis=1)
         exact = fit.deviation <= EQUAL_OF_RADIUS * self.molecule.radius
-        changes = ~(exact & keeps) & (fit.deviation <= 2 * self.limit)
+        changes = ~(exact & self._keeps_parameters(orders, fit)) & (fit.deviation <= 2 * self.limit)
         return np.concatenate([same, orders[changes][fit.square[changes].argsort(kind="stable")]])
+
+    def _keeps_parameters(self, orders: np.ndarray, fit: TemplateFit) -> np.ndarray:
+        """Whether sites (k, s) of a template in other orders, fitted to it, have the parameters of
+        those that they replace, massless ones included."""
+        keys = self._parameters
+        sites = massive_sites(self.molecule)
+        keeps = (keys[sites][orders] == keys[sites]).all(axis=1)
+        massless = np.setdiff1d(np.arange(len(keys)), sites)
+        if len(massless):
+            at = self.molecule.positions_body[massless]
+            moved = fit.centre[:, None] + np.einsum("kij,sj->ksi", fit.rotation, at)
+            distance = np.linalg.norm(moved[:, :, None] - at, axis=3)
+            close = (
+                distance
+                <= 2 * fit.deviation[:, None, None] + EQUAL_OF_RADIUS * self.molecule.radius
+            )
+            keeps &= (close & (keys[massless][:, None] == keys[massless])).any(axis=2).all(axis=1)
+        return keeps
 
     @cached_property
     def _parameters(self) -> np.ndarray:
-        """A number for each atom of the molecule (s,), the same for those with the same
+        """A number for each site of the molecule (s,), the same for sites with the same
         parameters."""
         m = self.molecule
         custom = [tuple(sorted(values.items())) for values in m.parameters] or [()] * len(m.masses)
-        columns = (m.masses, m.charges, m.sigma, m.epsilon)
-        keys = zip(*(values.tolist() for values in columns), custom, strict=True)
-        return numbered(keys)[massive_sites(m)]
+        values = (
+            m.masses.tolist(),
+            m.charges.tolist(),
+            m.sigma.tolist(),
+            m.epsilon.tolist(),
+            custom,
+        )
+        return numbered(zip(*values, strict=True))
 
     @cached_property
     def _variants(self) -> np.ndarray:
         """A number for each of the orders `_alike` (k,), the same if each atom has the same
         parameters in them."""
-        placed = self._parameters[self._alike.argsort(axis=1)]
-        return numbered(map(tuple, placed.tolist()))
+        alike = self._alike
+        keys = self._parameters[massive_sites(self.molecule)]
+        placed = np.empty_like(alike)
+        np.put_along_axis(placed, alike, np.broadcast_to(keys, alike.shape), axis=1)
+        fit = fit_template(self._template[alike], self.molecule)
+        keeps_of_orders = self._keeps_parameters(alike, fit) | (placed != keys).any(axis=1)
+        # a symmetry of the atoms that is none of the massless sites is a variant of its own
+        return numbered(
+            [
+                (*row, k * (not keeps))
+                for k, (row, keeps) in enumerate(zip(placed.tolist(), keeps_of_orders, strict=True))
+            ]
+        )
 
     def _best_of_alike(self, points: np.ndarray, order: np.ndarray) -> Assignment:
         """The best of the orders (m, s) and those like them, and how well the best unlike one
@@ -258,7 +291,8 @@ class Orders:
 
         def sorted_distances(points: np.ndarray) -> np.ndarray:
             distance = np.linalg.norm(points[:, i] - points[:, j], axis=2)
-            return np.sort(FARTHEST * pair + distance, axis=1)
+            order = np.lexsort((distance, np.broadcast_to(pair, distance.shape)), axis=1)
+            return np.take_along_axis(distance, order, 1)
 
         template_distances = sorted_distances(self._template[None])
         blocks = np.array_split(points, 1 + len(points) * len(i) // MOST_DISTANCES)
@@ -301,8 +335,9 @@ class Orders:
             np.fill_diagonal(apart, np.inf)
             mismatch = np.maximum(np.maximum(off[0][:, None], off[1]), apart).ravel()
             pairs = np.stack(np.unravel_index(np.arange(mismatch.size), apart.shape), axis=1)
-        likely = mismatch.argsort(kind="stable")[: np.count_nonzero(mismatch <= slack)]
-        likely = likely[:MOST_STARTS]
+        likely = mismatch.argsort(kind="stable")[: np.count_nonzero(mismatch <= slack)][
+            :MOST_STARTS
+        ]
         size = max(FIRST_STARTS, MOST_DISTANCES // len(centred) ** 2)
         for first, last in pairwise([0, *range(FIRST_STARTS, len(likely), size), len(likely)]):
             if last > first:

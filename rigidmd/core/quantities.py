@@ -56,7 +56,7 @@ class Quantity:
     is_averaged : whether its mean has a meaning
     of_tensor : whether log.csv has it on request, and pressure_tensor.csv has it
     of_box : whether its mean is shown of stages that change the box only
-    mean : where its mean is shown. If it `is_averaged` no mean, the rate at which it drifts
+    mean : where its mean is shown; of one that is not averaged, where its drift is shown
     """
 
     name: str  # in Python

@@ -332,6 +332,22 @@ def test_orders_that_fit_equally_well_are_named(tmp_path):
     assert read(tmp_path, text, "a.gro", [kind]).notes == ()  # names decide
 
 
+@pytest.mark.parametrize(("along", "noted"), [(0.0, False), (0.2, True)])
+def test_a_massless_charge_distinguishes_equal_atoms(along, noted, tmp_path):
+    """Two equal atoms and a charge without mass: off the middle, each order is another molecule."""
+    sites = [
+        Site(name=name, element="N", mass_u=14.0, position_A=(x, 0.0, 0.0))
+        for name, x in (("N1", 0.55), ("N2", -0.55))
+    ]
+    sites.append(Site(name="M", mass_u=0.0, charge_e=0.5, position_A=(along, 0.0, 0.0)))
+    kind = molecule("dimer", tuple(sites))
+    truth = Truth([kind] * 3, 34)
+    atoms = [atom for atom in truth.atoms() if atom[0] != "M"]
+    found = read(tmp_path, truth.xyz(atoms), "a.xyz", [kind])
+    wanted = "3 molecules of dimer: two orders of its atoms, in which different sites are exchanged"
+    assert any(note.startswith(wanted) for note in found.notes) == noted
+
+
 def test_names_that_fit_less_well_than_elements_are_noted(tmp_path):
     """Another program has numbered the atoms in the other direction."""
     kind = united_propene(("C1", "C2", "C3"))

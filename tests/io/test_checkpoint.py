@@ -205,6 +205,18 @@ def test_wrong_numbers_in_a_checkpoint_do_no_harm(kind, count, tmp_path):
     assert refused > 0
 
 
+def test_kept_forces_that_are_not_numbers_are_refused(again, printed):
+    kept = read_checkpoint(again / "run" / CHECKPOINT)
+    lost = np.full_like(kept.arrays["engine/load.force"], np.nan)
+    write_checkpoint(
+        again / "run", Checkpoint(kept.values, kept.arrays | {"engine/load.force": lost})
+    )
+    before = everything(again / "run")
+    said = printed("resume", again / "run", code=2).err
+    assert "its state has another force than was kept with it" in said
+    assert everything(again / "run") == before
+
+
 @pytest.mark.parametrize("damage", ["flipped", "cut", "empty"])
 def test_a_damaged_checkpoint_gives_way_to_the_one_before(damage, again, printed):
     path = again / "run" / CHECKPOINT

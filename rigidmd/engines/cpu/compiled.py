@@ -262,9 +262,9 @@ class CompiledEngine(Engine, Generic[ModelT, Bound]):
             raise ValueError(f"forces cannot be evaluated at its state: {error}") from None
         rounding = ROUNDING[self._setup.dtype]
         for name, evaluated, recalled in zip(Load._fields, load, self.load or (), strict=True):
-            if np.abs(evaluated - recalled).max(initial=0.0) > rounding * np.abs(evaluated).max(
-                initial=0.0
-            ):
+            largest = np.abs(evaluated).max(initial=0.0)
+            # forces that are not finite differ, too
+            if not np.abs(evaluated - recalled).max(initial=0.0) <= rounding * largest:
                 raise ValueError(f"its state has another {name} than was kept with it")
         self._recall_lists(state, arrays_of)  # the evaluation may have built others
 

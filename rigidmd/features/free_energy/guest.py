@@ -198,9 +198,8 @@ def _reassembled(system: System, host: np.ndarray, added: list[Molecule]) -> Sys
     frozen = np.append(system.model.inverse_mass == 0, np.zeros(len(added), bool))
     model = model_of(species, np.append(system.model.species[host], new), frozen)
     state = _selected(system.state, host)
-    rotates = len(system.state.rotation) > 0 or bool(
-        model.inertia.any()
-    )  # also of frozen molecules
+    # also of frozen molecules
+    rotates = len(system.state.rotation) > 0 or bool(model.inertia.any())
     for _ in added:
         state = _with_trial(state, np.zeros(3), np.eye(3), rotates=rotates)
     scene = system.scene

@@ -10,7 +10,7 @@ from rigidmd.compile import chosen_by_type, is_a, kernel
 from rigidmd.compile.simd import inverse_root_and_cube, inverse_square_root
 from rigidmd.features.potentials.sites.custom import CustomPotential
 from rigidmd.forces.neighbors import pair_loop as pairs
-from rigidmd.forces.neighbors.space import nearest_image
+from rigidmd.forces.neighbors.space import image_in_box
 from rigidmd.forces.potentials.coulomb import ReactionField, radial
 from rigidmd.forces.potentials.lennard_jones import LennardJones, ScreenedDispersion
 from rigidmd.forces.potentials.screened_coulomb import (
@@ -132,18 +132,18 @@ def add_guest_energies(potential, core, guest, host, guest_strength, host_streng
     cell (3, 3) : as in `State`; images within half its shortest diagonal element are the nearest
     energy (m,) : u Å²/ps²; becomes inf where two sites are nearer than `core`
     """
+    periodic = cell[0, 0] < inf
     reach = potential.cutoff * potential.cutoff
     least = core * core
     for m in range(len(guest)):
         total = 0.0
         for a in range(guest.shape[1]):
             for b in range(len(host)):
-                dx, dy, dz = nearest_image(
-                    cell,
-                    guest[m, a, 0] - host[b, 0],
-                    guest[m, a, 1] - host[b, 1],
-                    guest[m, a, 2] - host[b, 2],
-                )
+                dx = guest[m, a, 0] - host[b, 0]
+                dy = guest[m, a, 1] - host[b, 1]
+                dz = guest[m, a, 2] - host[b, 2]
+                if periodic:
+                    dx, dy, dz = image_in_box(cell, dx, dy, dz)
                 r2 = dx * dx + dy * dy + dz * dz
                 if r2 < least:
                     total = inf

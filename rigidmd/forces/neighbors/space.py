@@ -118,9 +118,16 @@ def nearest_image(cell, x, y, z):
     """The nearest image of a vector, Å, in a cell (3, 3) with a along x and b in the xy plane; for
     vectors within half of the shortest edge."""
     if cell[0, 0] < inf:
-        along = np.rint(z / cell[2, 2])
-        x, y, z = x - along * cell[2, 0], y - along * cell[2, 1], z - along * cell[2, 2]
-        along = np.rint(y / cell[1, 1])
-        x, y = x - along * cell[1, 0], y - along * cell[1, 1]
-        x -= np.rint(x / cell[0, 0]) * cell[0, 0]
+        x, y, z = image_in_box(cell, x, y, z)
     return x, y, z
+
+
+@kernel(inline=True)
+def image_in_box(cell, x, y, z):
+    """`nearest_image` where there is a box. A loop over many vectors asks for the box once, before:
+    insertions take 1.8 times as long if it does not."""
+    along = np.rint(z / cell[2, 2])
+    x, y, z = x - along * cell[2, 0], y - along * cell[2, 1], z - along * cell[2, 2]
+    along = np.rint(y / cell[1, 1])
+    x, y = x - along * cell[1, 0], y - along * cell[1, 1]
+    return x - np.rint(x / cell[0, 0]) * cell[0, 0], y, z
