@@ -153,6 +153,16 @@ class Feature:
         colour (3,), NaN for one by the direction of its axis."""
         return iter(())
 
+    def step_biases(
+        self, system: object, stage: object, columns: dict
+    ) -> dict[str, tuple[float, float, float]] | str:
+        """Means of columns of the log less those at a time step of zero, their errors, and the
+        errors of the means at zero, by name, or why they are not known.
+
+        columns : the samples (l,) of the production of a stage, by name
+        """
+        return {}
+
     def page_parts(self, record: object) -> Iterator[tuple[str, Iterator[str]]]:
         """(title, HTML texts) of parts of the page of a run."""
         return iter(())

@@ -186,6 +186,19 @@ class Scheme(_SchemeFields):
         return (1 / 6 - moment) / 2
 
     @property
+    def shadow_squares(self) -> float:
+        """The number in the shadow Hamiltonian, H + dt² [shadow_correction p U'' p +
+        shadow_squares (sum F²/m + sum n²/I)]; 0 from order 4 on."""
+        kicked = moment = gradients = 0.0
+        for flow in self.flows:
+            if flow.kind == KICK:
+                kicked += flow.fraction
+                gradients += flow.fraction * flow.gradient
+            elif flow.kind == DRIFT:
+                moment += flow.fraction * kicked * (1 - kicked)
+        return (1 / 6 - moment - gradients) / 2
+
+    @property
     def has_gradient(self) -> bool:
         return any(flow.gradient for flow in self.flows)
 

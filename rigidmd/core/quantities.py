@@ -57,6 +57,8 @@ class Quantity:
     of_tensor : whether log.csv has it on request, and pressure_tensor.csv has it
     of_box : whether its mean is shown of stages that change the box only
     mean : where its mean is shown; of one that is not averaged, where its drift is shown
+    gradient : its gradient over the gradient of the potential energy; NaN where it is unknown
+    kinetic : the motions whose kinetic energy it contains
     """
 
     name: str  # in Python
@@ -68,6 +70,8 @@ class Quantity:
     of_tensor: bool = False
     of_box: bool = False
     mean: Mean | None = None
+    gradient: float = nan
+    kinetic: tuple[str, ...] = ()
 
     @property
     def mean_header(self) -> str:
@@ -76,6 +80,10 @@ class Quantity:
 
     def value(self, observation: object) -> float | str:
         return self.of(observation) if self.of else getattr(observation, self.name)
+
+
+#: Whose kinetic energies add up.
+MOTIONS = ("translation", "rotation")
 
 
 def energy_of_force(name: str) -> Quantity:
@@ -105,6 +113,7 @@ def _edge(name: str, k: int) -> Quantity:
         lambda o: o.edges[k],
         of_box=True,
         mean=Mean(f"{name}{{}}_A", "box", label=name),
+        gradient=0.0,
     )
 
 
@@ -134,7 +143,7 @@ def _density(o) -> float:
     return o.system.mass / volume / GRAM_PER_CM3 if volume < inf else nan
 
 
-def _squares(name: str) -> Callable[..., float]:
+def _sum(name: str) -> Callable[..., float]:
     def of(o) -> float:
         value = getattr(o.sums, name)
         return value / o.energy_unit if isfinite(value) else nan
@@ -172,14 +181,22 @@ QUANTITIES = {
                 brief="U per molecule (kJ/mol)",
                 is_main=True,
             ),
+            gradient=1.0,
         ),
         Quantity(
             "kinetic",
             "Kinetic Energy (kJ/mole)",
             "kJ/mol",
             "kinetic energy, translation and rotation",
+            kinetic=MOTIONS,
         ),
-        Quantity("energy", "Total Energy (kJ/mole)", "kJ/mol", "potential and kinetic energy"),
+        Quantity(
+            "energy",
+            "Total Energy (kJ/mole)",
+            "kJ/mol",
+            "potential and kinetic energy",
+            kinetic=MOTIONS,
+        ),
         Quantity(
             "temperature",
             "Temperature (K)",
@@ -194,6 +211,7 @@ QUANTITIES = {
                 order=0,
                 is_main=True,
             ),
+            kinetic=MOTIONS,
         ),
         Quantity(
             "volume",
@@ -202,6 +220,7 @@ QUANTITIES = {
             "volume of the box",
             _volume,
             of_box=True,
+            gradient=0.0,
         ),
         Quantity(
             "density",
@@ -211,6 +230,7 @@ QUANTITIES = {
             _density,
             of_box=True,
             mean=Mean("density{}_g_cm3", "density", digits=4, order=5, is_main=True),
+            gradient=0.0,
         ),
         _unaveraged("stage_name", "Stage", "", "name of the stage"),
         Quantity(
@@ -227,6 +247,7 @@ QUANTITIES = {
                 short_digits=1,
                 order=1,
             ),
+            kinetic=MOTIONS[:1],
         ),
         Quantity(
             "temperature_rotation",
@@ -242,6 +263,7 @@ QUANTITIES = {
                 short_digits=1,
                 order=2,
             ),
+            kinetic=MOTIONS[1:],
         ),
         Quantity(
             "pressure_bar",
@@ -257,6 +279,7 @@ QUANTITIES = {
                 order=4,
                 is_main=True,
             ),
+            kinetic=MOTIONS[:1],
         ),
         _unaveraged(
             "drift",
@@ -322,14 +345,22 @@ QUANTITIES = {
             "F^2/m (kJ/mole/ps^2)",
             "kJ/mol/ps²",
             "sum of F²/m of all molecules",
-            _squares("force"),
+            _sum("force"),
         ),
         _unaveraged(
             "torque_squares",
             "n^2/I (kJ/mole/ps^2)",
             "kJ/mol/ps²",
             "the same of torques n",
-            _squares("torque"),
+            _sum("torque"),
+        ),
+        _unaveraged(
+            "curvature",
+            "v U'' v (kJ/mole/ps^2)",
+            "kJ/mol/ps²",
+            "second derivative of the potential energy along free flight and free rotation, in the"
+            " middle of the step before",
+            _sum("curvature"),
         ),
     )
 }

@@ -20,6 +20,8 @@ class StateSums(NamedTuple):
     momentum_flux: np.ndarray  # (3, 3) sum m V (x) V
     force_squares: np.ndarray  # (3, 3) sum F (x) F/m
     orthogonality_error: float  # largest entry of |Q^T Q - 1|; NaN if one is
+    #: Second derivative of the potential energy along the free motion, sum v U'' v; NaN if unknown
+    curvature: float
 
     @property
     def force(self) -> float:
@@ -28,7 +30,7 @@ class StateSums(NamedTuple):
 
 
 #: Number of the numbers in `StateSums`.
-SUM_COUNT = 18
+SUM_COUNT = 19
 
 
 class LargestValues(NamedTuple):
@@ -78,6 +80,7 @@ def _largest(values):
 def sums_of_state(model: Model, state: State, load: Load = EXAMPLE[1]) -> StateSums:
     """Sums over a state and the load on it. Without a load those of forces and torques are 0."""
     sums = np.zeros(SUM_COUNT)
+    sums[CURVATURE] = np.nan
     fill_sums(
         model.species,
         model.mass,
@@ -105,20 +108,23 @@ def unpack_sums(sums: np.ndarray) -> StateSums:
         momentum_flux=flux,
         force_squares=squares,
         orthogonality_error=orthogonality_error,
+        curvature=float(sums[CURVATURE]),
     )
 
 
 #: Positions of symmetric tensors in the numbers of `fill_sums`: xx, yy, zz, xy, xz, yz.
 _TENSOR = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
 FLUX, SQUARES = 6 + _TENSOR, 12 + _TENSOR
+#: Position of the curvature, which `fill_sums` leaves as it is.
+CURVATURE = 18
 
 
 @kernel(from_python=True)
 def fill_sums(
     species, mass, inverse_mass, inverse_inertia, velocity, rotation, angular, force, torque, found
 ):
-    """Write the numbers (SUM_COUNT,) of `StateSums`: rotation, torque, orthogonality, momentum, the
-    momentum flux and the squares of forces."""
+    """Write the numbers (SUM_COUNT,) of `StateSums` but the curvature: rotation, torque,
+    orthogonality, momentum, the momentum flux and the squares of forces."""
     px = py = pz = turning = twisted = worst = 0.0
     for m in range(len(velocity)):
         m_i = mass[species[m]]
@@ -160,3 +166,28 @@ def _fill_squares(species, weights, vectors, found, at):
         yz += weight * y * z
     found[at], found[at + 1], found[at + 2] = xx, yy, zz
     found[at + 3], found[at + 4], found[at + 5] = xy, xz, yz
+
+
+@kernel
+def power_and_squares(model, state, load):
+    """The power of a load, sum F V + sum n . I^-1 L, and sum F²/m + sum n . I^-1 n."""
+    power = squares = 0.0
+    for m in range(len(state.velocity)):
+        weight = model.inverse_mass[model.species[m]]
+        for k in range(3):
+            power += load.force[m, k] * state.velocity[m, k]
+            squares += weight * load.force[m, k] ** 2
+    for m in range(len(load.torque_body)):
+        for k in range(3):
+            weighted = model.inverse_inertia[model.species[m], k] * load.torque_body[m, k]
+            power += weighted * state.angular_momentum_body[m, k]
+            squares += weighted * load.torque_body[m, k]
+    return power, squares
+
+
+@kernel
+def curvature(model, state, load, before, dt):
+    """Sum v U'' v in the middle of a step: the mean squares of its loads less the change of the
+    power. before : power and squares at its start"""
+    power, squares = power_and_squares(model, state, load)
+    return 0.5 * (before[1] + squares) - (power - before[0]) / dt

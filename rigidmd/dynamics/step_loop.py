@@ -19,9 +19,11 @@ from rigidmd.compile import (
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import NOW, OK, ORIGIN, Load
 from rigidmd.dynamics.observables import (
+    CURVATURE,
     SUM_COUNT,
     LargestValues,
     StateSums,
+    curvature,
     fill_sums,
     find_largest,
     unpack_sums,
@@ -33,6 +35,7 @@ from rigidmd.dynamics.step_parts import (
     LAST,
     PLAIN,
     REPEATED,
+    WATCHED,
     StepParts,
     extension_of,
 )
@@ -66,12 +69,13 @@ def acting(intervals, state, call):
     """Bits of the rows that act in the next step, see `step_parts.EVERY`."""
     step = state.step[NOW]
     bits = EVERY | due(intervals, state, step)
-    if step + 1 == call[UNTIL]:
-        bits |= LAST | (ENERGIES if call[OBSERVED] != 0 else 0)
-    if step == call[START] or due(intervals, state, step - 1) & LAST != 0:
-        bits |= FIRST
-    else:
-        bits |= REPEATED
+    left = call[UNTIL] - step
+    if call[OBSERVED] != 0 and left <= 2:
+        bits |= LAST | (ENERGIES | WATCHED if left == 1 else 0)
+    elif left == 1:
+        bits |= LAST
+    follows = due(intervals, state, step - 1) & LAST != 0 or bits & WATCHED != 0
+    bits |= FIRST if step == call[START] or follows else REPEATED
     return bits if bits & ENERGIES != 0 else bits | PLAIN
 
 
@@ -102,7 +106,7 @@ class Advance:
         self._program = bound_program(table.passes, core.status)
         self._parts, self._call = parts, np.zeros(4, np.int64)
         self._extent, self._sums = np.zeros(len(LargestValues._fields)), np.zeros(SUM_COUNT)
-        steps = self._program.rows, table.intervals, core.registers.row, self._call
+        steps = self._program.rows, table.intervals, core.registers, self._call
         self._task = BoundTask(
             _advance, (core.model, core.state, core.load, steps, self._extent, self._sums)
         )
@@ -114,7 +118,7 @@ class Advance:
         """
         _, state, _, registers, _, terms, _ = self._parts.core
         self._call[:] = state.step[NOW], until, observed, OK
-        registers.dt[0], registers.row[0] = dt, 0
+        registers.dt[0], registers.row[0], registers.before[:] = dt, 0, np.nan
         known = int(registers.known[0]) | FORCES_ONLY if is_current else 0
         if terms is not None and not terms.tallies_valid[0]:
             known &= ~(WITH_ENERGIES | WITH_VIRIALS)
@@ -156,8 +160,8 @@ def bound_program(passes: list[Pass], status: np.ndarray) -> Program:
 @task()
 def _advance(arguments, block):
     model, state, load, steps, extent, sums = load_arguments(arguments)
-    rows, intervals, row, call = steps
-    call[STATUS] = advance(rows, intervals, state, row, call)
+    rows, intervals, registers, call = steps
+    call[STATUS] = advance(rows, intervals, state, registers.row, call)
     if call[STATUS] == OK:
         find_largest(
             state.position.ravel(),
@@ -181,3 +185,4 @@ def _advance(arguments, block):
                 load.torque_body,
                 sums,
             )
+            sums[CURVATURE] = curvature(model, state, load, registers.before, registers.dt[0])

@@ -14,8 +14,9 @@ from rigidmd.forces.terms import TermTable
 
 #: Bits of `Pass.when`: every step; the last step of a call, or before rows that act between two
 #: steps; the first step of a call, or after a LAST one; every other step; steps without energies
-#: and with them. INTERVAL and higher bits: the steps of an interval.
-EVERY, LAST, FIRST, REPEATED, PLAIN, ENERGIES, INTERVAL = (1 << n for n in range(7))
+#: and with them; the last step before an observation. INTERVAL and higher bits: the steps of an
+#: interval.
+EVERY, LAST, FIRST, REPEATED, PLAIN, ENERGIES, WATCHED, INTERVAL = (1 << n for n in range(8))
 
 
 class StepCore(NamedTuple):

@@ -8,7 +8,8 @@ from rigidmd.core.integrators import Flow
 from rigidmd.core.state import NOW, OK, ORIGIN, REMOVED, WORK
 from rigidmd.dynamics.force_gradient import add_gyration, displace, evaluate
 from rigidmd.dynamics.model import Model
-from rigidmd.dynamics.step_parts import EVERY, StepParts
+from rigidmd.dynamics.observables import power_and_squares
+from rigidmd.dynamics.step_parts import EVERY, WATCHED, StepParts
 from rigidmd.forces.neighbors.sites import blocks_of, molecules_of_block
 from rigidmd.forces.terms import (
     FORCES_ONLY,
@@ -180,6 +181,18 @@ def _add_work(arguments, block):
     work = 0.5 * h * total_energy_rate(core.terms)  # before the kick and after it
     core.state.energy_ledger[WORK] += work
     core.state.energy_ledger[WORK] += work
+
+
+def power_row(parts: StepParts) -> Pass:
+    """Power and squares of the forces before the last step, from which the curvature follows."""
+    return Pass("power of the forces", _keep_power, (parts.core,), when=WATCHED)
+
+
+@task()
+def _keep_power(arguments, block):
+    (core,) = load_arguments(arguments)
+    before = core.registers.before
+    before[0], before[1] = power_and_squares(core.model, core.state, core.load)
 
 
 def removal_row(parts: StepParts, when: int) -> Pass:

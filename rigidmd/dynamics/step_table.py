@@ -31,6 +31,7 @@ from rigidmd.dynamics.step_parts import (
     LAST,
     PLAIN,
     REPEATED,
+    WATCHED,
     StepParts,
     extension_of,
 )
@@ -39,6 +40,7 @@ from rigidmd.dynamics.step_rows import (
     gradient_row,
     move_row,
     orthogonality_row,
+    power_row,
     removal_row,
     work_row,
 )
@@ -48,7 +50,7 @@ from rigidmd.mechanics.free_rotor import ORTHOGONALITY_INTERVAL
 
 #: The steps in which a row acts, in words.
 WORDS = {EVERY: "", LAST: "last", FIRST: "first", REPEATED: "repeated"}
-WORDS |= {PLAIN: "without energies", ENERGIES: "with energies"}
+WORDS |= {PLAIN: "without energies", ENERGIES: "with energies", WATCHED: "before a sample"}
 #: Random numbers that a flow may draw for one molecule in a step.
 DRAWS = 1 << 20
 
@@ -91,6 +93,8 @@ class StepTable:
             timing = Timing(flow.fraction, DRAWS * k, when)
             if flow.kind in (KICK, DRIFT):
                 rows += self._forces_of_kicks(group)
+                if k == self._kicks[0] < self._drifts[0] and not scheme.has_groups:
+                    rows.append(power_row(parts))
                 if group is opening:
                     rows += [self._move(group, FIRST), self._move([*closing, *group], REPEATED)]
                 else:

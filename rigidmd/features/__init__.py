@@ -52,8 +52,9 @@ FEATURES = (
         "many runs: sweep, accuracy, comparison, stability, normal modes",
         needs=("analysis", "view"),
         commands=("accuracy", "compare", "modes", "stability", "sweep"),
+        analyses=("zero_step",),
         display="sweep.notebook",
-        provides=("analyse_sweep",),
+        provides=("analyse_sweep", "step_biases"),
     ),
     Row(
         "crystals",

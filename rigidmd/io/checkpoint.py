@@ -16,7 +16,7 @@ from rigidmd.io.folder import CHECKPOINT, PREVIOUS
 
 #: Version of the format. Version 1 (rigidmd 0.1) named observers by their number; 2 had no record
 #: of the run; 3 had other names.
-SCHEMA = 5
+SCHEMA = 6
 #: Members besides the arrays of the run: all other values as JSON, and names, lengths and CRC-32 of
 #: all other members.
 JSON, CONTENTS = "values", "contents"

@@ -16,6 +16,9 @@ POSITIONS = {
 
 #: Stages in the table of means of the short report.
 SHOWN_STAGES = 2
+#: The time-step error of a mean is shown from this fraction of the statistical error on, if it
+#: exceeds its error by this factor. Number of its digits.
+SHOWN_BIAS, SEEN, SHOWN_DIGITS = 1 / 3, 2.0, 2
 NO_ERROR_MARK = " ± ?"
 #: Names of ensembles.
 ENSEMBLES = {"nve": "NVE", "nvt": "NVT", "npt": "NPT", "nph": "NPH"}
@@ -196,7 +199,21 @@ def _with_error(stage: dict, key: str, places: int, no_error: str = "") -> str |
     value, error = (stage.get(key.format(of)) for of in ("", "_error"))
     if value is None:
         return None
-    return format_with_error(value, error) if error else f"{value:.{places}f}{no_error}"
+    if not error:
+        return f"{value:.{places}f}{no_error}"
+    return format_with_error(value, error) + _step_part(stage, key, error)
+
+
+def _step_part(stage: dict, key: str, error: float) -> str:
+    """What the time step adds to a mean, where this is known and not small against its error."""
+    bias, uncertain = (stage.get(key.format(of)) for of in ("_step", "_step_error"))
+    if (
+        bias is None
+        or uncertain is None
+        or not abs(bias) > max(SHOWN_BIAS * error, SEEN * uncertain)
+    ):
+        return ""
+    return f", step {bias:+.{SHOWN_DIGITS}g}"
 
 
 def _set_point(stage: dict, mean: Mean) -> str | None:

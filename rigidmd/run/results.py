@@ -13,6 +13,7 @@ from rigidmd.core.state import State
 from rigidmd.core.toml import Json
 from rigidmd.errors import OutputError
 from rigidmd.formats import BY_EXTENSION
+from rigidmd.run.production import Estimate, mean_of_production
 
 if TYPE_CHECKING:
     import ase
@@ -104,6 +105,27 @@ class Results(Displayed):
     def units(self) -> dict[str, str]:
         """Name -> unit of each column. "1" for numbers, empty for text."""
         return {name: column.unit for name, column in self.samples.described.items()}
+
+    def mean(self, name: str, *, zero_step: bool = False) -> Estimate:
+        """The mean of a quantity over the production of the last stage of molecules, with its
+        error, as in the summary: the potential energy is per molecule.
+
+        Parameters
+        ----------
+        name
+            Name of a column, or of a row of the summary with underscores: "potential_energy"
+        zero_step
+            At a time step of zero, from the fluctuations in the run: see `rigidmd analyse RUN
+            zero_step`
+
+        Raises
+        ------
+        KeyError
+            With all names.
+        OutputError
+            Without a mean or an error, or if what the step adds to it is not known.
+        """
+        return mean_of_production(self, name, zero_step=zero_step)
 
     def to_dataframe(self) -> "pandas.DataFrame":
         """The samples under the headers of log.csv (motion.csv of a body).

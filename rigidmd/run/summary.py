@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from rigidmd.core.quantities import QUANTITIES, Mean, Quantity, with_means
+from rigidmd.core.quantities import MOTIONS, QUANTITIES, Mean, Quantity, with_means
 from rigidmd.core.state import REMOVED, State
 from rigidmd.core.statistics import ENERGY_ERROR, format_with_error, mean_and_error, slope
 from rigidmd.core.toml import Json
@@ -19,6 +19,7 @@ from rigidmd.engines.samples import (
     equilibrated,
 )
 from rigidmd.engines.system import System
+from rigidmd.features import providers
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, BOLTZMANN, COULOMB, FEMTOSECOND, KJ_PER_MOL
 
@@ -39,7 +40,6 @@ HEATING_LIMIT, DIFFERENCE_LIMIT = 0.01, 0.01
 #: Largest fraction of T_trans in a common drift of all molecules without a note. Where the total
 #: momentum is thermal: its largest kinetic energy in kT, which one run in two million exceeds.
 COMMON_DRIFT_LIMIT, THERMAL_LIMIT = 1e-4, 16.0
-MOTIONS = ("translation", "rotation")
 #: Growth of the estimated error of Coulomb forces that has a note.
 ERROR_GROWTH_LIMIT = 1.5
 
@@ -389,7 +389,8 @@ def stage_summary(
     else:
         line = slope(time, drift)
     rows = [row for row in with_means(samples.described) if row[0].is_averaged]
-    means = _means(steady, [row for row in rows if stage.has_barostat or not row[0].of_box], n)
+    rows = [row for row in rows if stage.has_barostat or not row[0].of_box]
+    means = _means(steady, rows, n) | _step_biases(system, stage, steady, rows)
     spread = float(of_stage["kinetic"].std())
     duration = steps * stage.step
     thermal = BOLTZMANN / KJ_PER_MOL * (means["temperature_K"] or 0.0) * system.freedom_in(k).total
@@ -487,6 +488,25 @@ def _means(
                 values / divisor
             )
     return means
+
+
+def _step_biases(
+    system: System, stage: Stage, samples: Samples, rows: Iterable[tuple[Quantity, Mean]]
+) -> dict[str, float]:
+    """What the time step adds to means, with errors, where a feature knows it."""
+    if not stage.has_thermostat or stage.in_trajectories:
+        return {}
+    columns = {name: samples[name] for name, row in samples.described.items() if row.unit}
+    values = {}
+    for feature in providers("step_biases"):
+        found = feature.step_biases(system, stage, columns)
+        for quantity, mean in rows:
+            if not isinstance(found, str) and quantity.name in found:
+                divisor = len(system.model.species) if mean.per_molecule else 1
+                bias, error, _ = found[quantity.name]
+                values[mean.key.format("_step")] = bias / divisor
+                values[mean.key.format("_step_error")] = error / divisor
+    return values
 
 
 def _finite_or_none(value: float) -> float | None:

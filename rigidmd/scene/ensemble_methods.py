@@ -114,6 +114,11 @@ class Thermostat(EnsembleMethod):
         """Its time constant, ps. 0 for one that acts at once."""
         return values.get("thermostat_time_ps", 0.0)
 
+    def rates(self, values: Values) -> tuple[float, float]:
+        """The rates at which it relaxes the kinetic energies of translation and of rotation
+        separately, 1/ps; (0, 0) if it does not relax them linearly."""
+        return 0.0, 0.0
+
     def describe(self, values: Values) -> str:
         """What reports print after its name. By default its time constant."""
         return f"{time:g} ps" if (time := self.time(values)) else ""

@@ -135,7 +135,7 @@ def summarised(
         row = (
             dict.fromkeys(QUANTITIES, 0.0)
             | plain
-            | {"stage_name": "", "step": k, "stage": of_stage, "kinetic": 100.0}
+            | {"stage_name": "", "step": k, "stage": of_stage, "kinetic": 100.0, "volume": 1.0}
         )
         rows.append(
             Sample(

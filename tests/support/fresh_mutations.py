@@ -432,9 +432,9 @@ FRESH: list[Mutation] = [
     Mutation(
         "F50",
         "joint fit with a barostat that reads no momenta: the pressure with F²/12m for F²/36m",
-        "features/studies/joint_fit.py",
-        "    return float((moving + mean.of_forces / 36) / mean.volume)",
-        "    return float((moving + mean.of_forces / 12) / mean.volume)",
+        "features/studies/step_bias.py",
+        "hotter + of.squares[0] / 36) / of.volume",
+        "hotter + of.squares[0] / 12) / of.volume",
         ("features/studies/test_joint_fit.py::test_slopes_and_their_errors_are_those_of_springs",),
     ),
     Mutation(
@@ -693,8 +693,8 @@ FRESH: list[Mutation] = [
         "F79",
         "joint fit: fluctuations of the energy of all molecules are those of the mobile ones",
         "features/studies/joint_fit.py",
-        "of_enthalpy = at.count * with_enthalpy.potential",
-        "of_enthalpy = at.moving * with_enthalpy.potential",
+        "of_enthalpy = at.count * with_enthalpy[0]",
+        "of_enthalpy = at.moving * with_enthalpy[0]",
         ("features/studies/test_joint_fit.py::test_slopes_and_their_errors_are_those_of_springs",),
     ),
     Mutation(
@@ -837,6 +837,44 @@ FRESH: list[Mutation] = [
         '(p["epsilon_kJ_mol"] + q["epsilon_kJ_mol"]) / 2',
         (
             "features/external/test_lammps.py::test_a_liquid_of_ellipsoids_next_to_sites_is_the_same",
+        ),
+    ),
+    Mutation(
+        "F95",
+        "step of one run: the momentum form without the squares",
+        "features/studies/step_bias.py",
+        "    by_momenta += at.kick_number * covariance[:, ALL_SQUARES]\n",
+        "    by_momenta += 0.0 * covariance[:, ALL_SQUARES]\n",
+        (
+            "features/studies/test_step_bias.py::test_the_bias_of_a_coupled_oscillator_and_rotor_is_that_of_its_shadow_hamiltonian",
+        ),
+    ),
+    Mutation(
+        "F96",
+        "step of one run: two thermostats share their shifts",
+        "features/studies/step_bias.py",
+        "difference * covariance[:, DIFFERENCE_IN_TIME]) / thermal",
+        "0.0 * covariance[:, DIFFERENCE_IN_TIME]) / thermal",
+        ("features/studies/test_step_bias.py::test_two_thermostats_have_two_shifts",),
+    ),
+    Mutation(
+        "F97",
+        "the curvature without the squares of the load",
+        "dynamics/observables.py",
+        "    return 0.5 * (before[1] + squares) - (power - before[0]) / dt",
+        "    return -(power - before[0]) / dt",
+        (
+            "dynamics/test_registers.py::test_the_curvature_is_the_second_derivative_along_free_motion",
+        ),
+    ),
+    Mutation(
+        "F98",
+        "an integrator that begins with a drift has the numbers of one that begins with a kick",
+        "core/integrators.py",
+        "                moment += flow.fraction * kicked * (1 - kicked)",
+        "                moment += flow.fraction / 4",
+        (
+            "features/studies/test_step_bias.py::test_numbers_of_the_shadow_hamiltonian_are_those_of_an_oscillator",
         ),
     ),
 ]

@@ -64,6 +64,7 @@ class LastAdvance:
     observed: Load | None = (
         None  # the copy of the load that `evaluate_current` has returned, to which the sums belong
     )
+    evaluated: Load | None = None  # what it returned where it had to evaluate forces again
 
 
 class HasRotor(Protocol):
@@ -152,7 +153,7 @@ class CompiledEngine(Engine, Generic[ModelT, Bound]):
             self._dispatchers["steps"].table.tallies_valid[0] = 0
         if self.load is None:
             self.load = no_load(state)
-        last.state, last.observed = state, None
+        last.state, last.observed, last.evaluated = state, None, None
         step = float(dt), int(until), observed
         last.is_current = self._move(state, self.load, integrator, workspaces, step)
 

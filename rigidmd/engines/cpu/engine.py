@@ -13,7 +13,7 @@ from rigidmd.core.state import BEHIND_WALL, Load, State, copy_into
 from rigidmd.dynamics.barostats import BarostatWorkspace, barostat_workspace
 from rigidmd.dynamics.force_gradient import gradient_workspace
 from rigidmd.dynamics.model import Model
-from rigidmd.dynamics.observables import LargestValues, StateSums
+from rigidmd.dynamics.observables import LargestValues, StateSums, sums_of_state
 from rigidmd.dynamics.registers import KEPT_BY_BAROSTAT, KEPT_BY_EXTENSION, new_registers
 from rigidmd.dynamics.step_loop import Advance
 from rigidmd.dynamics.step_parts import StepCore, StepExtension, StepParts, extension_of
@@ -128,14 +128,21 @@ class CpuEngine(CompiledEngine[Model, Advance]):
             or moving is None
             or not (is_current and moving.table.tallies_valid[0])
         ):
-            return self.evaluate(state)
+            load, tallies = self.evaluate(state)
+            last.evaluated = load if is_current else None
+            return load, tallies
         last.observed, tallies = self._copies(self.load, moving)
         return last.observed, tallies
 
     def sums(self, state: State, load: Load) -> StateSums | None:
-        return (
-            self._bound[1].sums if self._bound is not None and load is self._last.observed else None
-        )
+        if self._bound is None:
+            return None
+        found = self._bound[1].sums
+        if load is self._last.observed:
+            return found
+        if load is not self._last.evaluated or found is None:
+            return None
+        return sums_of_state(self.model, state, load)._replace(curvature=found.curvature)
 
     def extent(self, state: State) -> LargestValues | None:
         last = self._last

@@ -1,18 +1,32 @@
-"""What this feature does for other features."""
+"""What this feature does for runs and for other features."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from rigidmd.commands import FAILED
-from rigidmd.commands.arguments import Options
+import numpy as np
+
+from rigidmd.engines.system import System
 from rigidmd.feature import Feature
+from rigidmd.scene.stage import Stage
+
+if TYPE_CHECKING:
+    from rigidmd.commands.arguments import Options
 
 
 class Studies(Feature):
+    def step_biases(
+        self, system: System, stage: Stage, columns: dict[str, np.ndarray]
+    ) -> dict[str, tuple[float, float, float]] | str:
+        from rigidmd.features.studies.step_bias import biases
+
+        return biases(system, stage, columns)
+
     def analyse_sweep(
-        self, folder: Path, request: tuple, more: dict, progress, options: Options
+        self, folder: Path, request: tuple, more: dict, progress, options: "Options"
     ) -> int:
         """Analyse a sweep for `rigidmd analyse`: print the results of each combination, and the
         extrapolation. An exit code."""
+        from rigidmd.commands import FAILED
         from rigidmd.features.analysis.commands.analyse import print_results
         from rigidmd.features.studies.commands.sweep import print_limits
         from rigidmd.features.studies.sweep.folder import read_manifest

@@ -10,12 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.core.integrators import DRIFT, KICK
 from rigidmd.core.quantities import QUANTITIES
 from rigidmd.core.statistics import inefficiency, mean_and_error
-from rigidmd.dynamics.model import mobile
 from rigidmd.engines.system import System
 from rigidmd.features.analysis.rigid_frames import production_samples
+from rigidmd.features.studies import step_bias
 from rigidmd.features.studies.extrapolation import (
     BiasFit,
     MeanAtStep,
@@ -24,39 +23,28 @@ from rigidmd.features.studies.extrapolation import (
     least_squares,
     means_of_runs,
 )
+from rigidmd.features.studies.step_bias import (
+    BAR_NM3,
+    BLOCKS,
+    GAS_CONSTANT,
+    LEAST_SAMPLES,
+    NEXT_TERM,
+    Conditions,
+    Moments,
+    Series,
+    beyond_first_order,
+    conditions,
+    mean_square,
+    moments_of_run,
+    series_of,
+    slopes,
+)
 from rigidmd.run.record import Record
-from rigidmd.scene.stage import Stage
-from rigidmd.units import BAR, BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
+from rigidmd.units import FEMTOSECOND
 
 POTENTIAL, VOLUME, DENSITY = (
     QUANTITIES[name].mean_header for name in ("potential", "volume", "density")
 )
-#: Sums of squares of forces and torques in the log.
-SQUARES = ("force_squares", "torque_squares")
-GAS_CONSTANT = BOLTZMANN / KJ_PER_MOL  # kJ/mol/K
-BAR_NM3 = 1e3 * BAR / KJ_PER_MOL  # kJ/mol
-#: Blocks of a run that give errors of what fluctuations predict, and their correlations.
-BLOCKS = 10
-#: Minimum number of independent samples of a run whose fluctuations count.
-LEAST_SAMPLES = 20.0
-
-
-class Conditions(NamedTuple):
-    """The state that a run samples, in kJ/mol, nm³, ps, K."""
-
-    step: float
-    temperature: float
-    pressure: float  # 0 at constant volume
-    count: int  # of molecules
-    moving: int  # of molecules that are not frozen
-    freedom: int
-    rotation: int  # degrees of freedom of rotation
-    correction: float  # see `Scheme.kinetic_correction`
-    reads_kinetic: bool
-
-    @property
-    def thermal_energy(self) -> float:
-        return GAS_CONSTANT * self.temperature
 
 
 class RunResults(NamedTuple):
@@ -73,105 +61,48 @@ def slope_name(quantity: str) -> str:
     return f"slope of {quantity}"
 
 
-def size_name(quantity: str) -> str:
-    """The summed sizes of the parts of a slope, which may cancel."""
-    return f"size of the slope of {quantity}"
+def rest_name(quantity: str) -> str:
+    """What the first order, and the interval of the log, leave out of a slope."""
+    return f"rest of the slope of {quantity}"
 
 
 #: Mean kinetic energy where the thermostat acts, less its value at the set temperature.
 BALANCE = "kinetic energy less its set value"
-#: Mean of (ω dt)² over the degrees of freedom. Times NEXT_TERM it is the fraction of a bias that
-#: its next term is taken to be: 1/4 in harmonic motions of one frequency, more where frequencies
-#: differ. In nitrogen at 90 K it was 1.4 ± 0.9, at (ω dt)² = 0.14.
+#: Mean of (ω dt)² over the degrees of freedom.
 MEAN_SQUARE = "(ω dt)²"
-NEXT_TERM = 1.0
-
-
-def why_not(stage: Stage) -> str:
-    """Why a stage has no joint fit. An empty text if it has one."""
-    moving = [(flow.kind, flow.fraction) for flow in stage.scheme.flows if flow.kind <= DRIFT]
-    drifts = sum(fraction for kind, fraction in moving if kind == DRIFT)
-    if stage.ensemble not in ("nvt", "npt"):
-        return f"it is for nvt and npt, and the stage is {stage.ensemble}"
-    if stage.ramps:
-        return "temperature or pressure change during the stage"
-    if stage.in_trajectories:
-        return f"{stage.thermostat_kind} has no time-step error"
-    if moving[0] != moving[-1] or moving[0] != (KICK, 0.5) or abs(drifts - 1) > 1e-12:
-        return f"it is for velocity_verlet and baoab, and the integrator is {stage.integrator}"
-    if stage.has_barostat and stage.pressure_coupling not in (None, "isotropic"):
-        return f"pressure_coupling is {stage.pressure_coupling!r}, not 'isotropic'"
-    return ""
 
 
 def results_of_run(record: Record[System]) -> RunResults | str:
     """Results of a run, or why it has none. Raises OutputError."""
     stage, production = production_samples(record)
-    if reason := why_not(stage):
-        return reason
-    at = _conditions(record, stage)
+    at = conditions(record.system, stage)
+    if isinstance(at, str):
+        return at
     columns = {name: values[production] for name, values in record.columns.items()}
-    if not all(np.isfinite(columns.get(name, np.nan)).all() for name in SQUARES):
-        names = " and ".join(QUANTITIES[name].header for name in SQUARES)
-        return f"the log has no {names}, which runs of earlier versions lack"
-    samples = _Samples(
-        columns["potential"] / at.count,
-        columns["volume"] if stage.has_barostat else np.zeros(production.sum()),
-        columns["density"] if stage.has_barostat else np.zeros(production.sum()),
-        columns["kinetic"],
-        columns["force_squares"] + columns["torque_squares"],
-        columns["force_squares"],
-    )
-    return results_of_samples(np.array(samples), at, has_barostat=stage.has_barostat)
+    series = series_of(columns, at)
+    if isinstance(series, str):
+        return series
+    return beyond_first_order(series, at) or results_of_samples(columns["density"], series, at)
 
 
-def _conditions(record: Record[System], stage: Stage) -> Conditions:
-    system = record.system
-    freedom = system.freedom_in(system.scene.stages.index(stage))
-    return Conditions(
-        stage.step,
-        stage.temperatures[0],
-        stage.pressures[0][0] * BAR_NM3 if stage.has_barostat else 0.0,
-        len(system.model.species),
-        int(mobile(system.model).sum()),
-        freedom.total,
-        freedom.rotation,
-        stage.scheme.with_thermostat(()).kinetic_correction,
-        stage.barostat_method.reads_momenta,
-    )
-
-
-class _Samples(NamedTuple):
-    """Series (l,), or their means, or their covariances with one of them."""
-
-    potential: np.ndarray  # per molecule
-    volume: np.ndarray
-    density: np.ndarray
-    kinetic: np.ndarray
-    squares: np.ndarray  # sum F²/m + sum n²/I
-    of_forces: np.ndarray  # sum F²/m
-
-
-def results_of_samples(samples: np.ndarray, at: Conditions, *, has_barostat: bool) -> RunResults:
-    """Results of series (6, l) of `_Samples`."""
-    length = samples.shape[1] // BLOCKS
-    if length == 0:
+def results_of_samples(density: np.ndarray, series: Series, at: Conditions) -> RunResults:
+    """Results of the samples of a run."""
+    if len(density) < BLOCKS:
         return RunResults({}, {}, np.zeros((BLOCKS, 0)), 0)
-    blocks = samples[:, -BLOCKS * length :].reshape(len(samples), BLOCKS, length)
-    values = _evaluate(blocks, at, has_barostat=has_barostat)
-    without = [
-        _evaluate(np.delete(blocks, k, 1), at, has_barostat=has_barostat) for k in range(BLOCKS)
-    ]
-    table = np.array([list(found.values()) for found in without])
+    observed = dict(
+        zip(_observables(at), (series.potential / at.count, series.volume, density), strict=False)
+    )
+    observed[BALANCE] = series.kinetic[0] + series.kinetic[1]
+    found, *without = (
+        _evaluate(of, at) for of in moments_of_run(np.array([*observed.values()]), series, at)
+    )
+    table = np.array([list(one.values()) for one in without])
     changes = (table - table.mean(axis=0)) * sqrt((BLOCKS - 1) / BLOCKS)
-    errors = dict(zip(values, np.linalg.norm(changes, axis=0).tolist(), strict=True))
-    series = _Samples(*samples)
-    averaged = dict(zip(_observables(has_barostat=has_barostat), series, strict=False))
-    averaged[BALANCE] = series.kinetic + at.correction * at.step**2 * series.squares
-    errors |= {name: mean_and_error(values)[1] for name, values in averaged.items()}
-    known = all(map(_is_long, averaged.values()))
+    errors = dict(zip(found, np.linalg.norm(changes, axis=0).tolist(), strict=True))
+    errors |= {name: mean_and_error(values)[1] for name, values in observed.items()}
+    known = all(map(_is_long, observed.values()))
     errors = {name: error if known else None for name, error in errors.items()}
-    return RunResults(values, errors, changes, samples.shape[1])
+    return RunResults(found, errors, changes, len(density))
 
 
 def _is_long(series: np.ndarray) -> bool:
@@ -179,74 +110,43 @@ def _is_long(series: np.ndarray) -> bool:
     return len(series) >= LEAST_SAMPLES * inefficiency(series - series.mean())
 
 
-def _observables(*, has_barostat: bool) -> list[str]:
-    return [POTENTIAL, VOLUME, DENSITY] if has_barostat else [POTENTIAL]
+def _observables(at: Conditions) -> list[str]:
+    return [POTENTIAL, VOLUME, DENSITY] if at.has_barostat else [POTENTIAL]
 
 
-def _evaluate(blocks: np.ndarray, at: Conditions, *, has_barostat: bool) -> dict[str, float]:
+def _evaluate(of: Moments, at: Conditions) -> dict[str, float]:
     """Means, their slopes over dt² (per fs²), and responses at constant pressure or volume."""
-    means = blocks.mean(axis=(1, 2))
-    deviations = blocks - means[:, None, None]
-    covariance = np.einsum("ibl,jbl->ij", deviations, deviations) / blocks[0].size
-    covariance += np.cov(blocks.mean(axis=2)) / blocks.shape[1]  # hidden by the sample means
-    mean = _Samples(*means)
-    with_potential, with_volume, *_ = map(_Samples._make, covariance)
-    with_squares = _Samples(*covariance[4])
-    enthalpy = [
-        at.count * one + at.pressure * other
-        for one, other in zip(with_potential, with_volume, strict=True)
-    ]
-    with_enthalpy = _Samples(*enthalpy)
-    hotter = _heating(mean, at)
-    denser = _compression(mean, at, hotter) if has_barostat else 0.0
-    found = dict(zip(_observables(has_barostat=has_barostat), means.tolist(), strict=False))
-    for k, name in enumerate(list(found)):
-        direct = -with_squares[k] / 24
-        if name == POTENTIAL:
-            direct += at.thermal_energy * mean.squares / at.count / 12
-        parts = np.array([direct, with_enthalpy[k] * hotter, -with_volume[k] * denser])
-        parts *= FEMTOSECOND**2 / at.thermal_energy
-        found[slope_name(name)] = float(parts.sum())
-        found[size_name(name)] = float(np.abs(parts).sum())
-    set_energy = at.freedom * at.thermal_energy / 2
-    found[MEAN_SQUARE] = float(at.step**2 * mean.squares / at.freedom / at.thermal_energy)
-    found[BALANCE] = float(mean.kinetic + at.correction * at.step**2 * mean.squares - set_energy)
-    return found | _responses(mean, with_volume, with_enthalpy, at, has_barostat=has_barostat)
+    names = _observables(at)
+    of_columns = of._replace(covariance=of.covariance[: len(names)])
+    gradients = [1 / at.count, 0.0, 0.0]
+    slope = slopes(of_columns, at, gradients[: len(names)])
+    found = dict(zip(names, of.mean.tolist(), strict=False))
+    square = mean_square(of.squares, at)
+    for k, name in enumerate(names):
+        found[slope_name(name)] = FEMTOSECOND**2 * float(slope.value[k])
+        rest = np.hypot(NEXT_TERM * square * slope.size[k], slope.missed[k])
+        found[rest_name(name)] = FEMTOSECOND**2 * float(rest)
+    found[MEAN_SQUARE] = square
+    found[BALANCE] = float(of.mean[-1]) - at.all_freedom * at.thermal_energy / 2
+    return found | _responses(of, at)
 
 
-def _heating(mean: _Samples, at: Conditions) -> float:
-    """(T' - T)/T over dt², with the temperature T' of the shadow Hamiltonian, 1/ps²."""
-    set_energy = at.freedom * at.thermal_energy / 2
-    return float(mean.squares * (1 / 12 - at.correction) / set_energy)
-
-
-def _compression(mean: _Samples, at: Conditions, hotter: float) -> float:
-    """p' - p over dt², kJ/mol/nm³/ps², where the barostat holds the pressure p."""
-    if at.reads_kinetic:
-        return float(mean.of_forces / 12 / mean.volume)
-    moving = at.moving * at.thermal_energy * hotter
-    return float((moving + mean.of_forces / 36) / mean.volume)
-
-
-def _responses(
-    mean: _Samples,
-    with_volume: _Samples,
-    with_enthalpy: _Samples,
-    at: Conditions,
-    *,
-    has_barostat: bool,
-) -> dict[str, float]:
+def _responses(of: Moments, at: Conditions) -> dict[str, float]:
     """Response functions from fluctuations, with the part of the momenta as it is in theory."""
-    thermal = at.thermal_energy
-    momenta = 0.5 * GAS_CONSTANT * (3 * at.moving + at.rotation)
-    of_enthalpy = at.count * with_enthalpy.potential + at.pressure * with_enthalpy.volume
+    thermal, covariance = at.thermal_energy, of.covariance
+    momenta = 0.5 * GAS_CONSTANT * (3 * at.moving + at.freedom[1])
+    with_enthalpy = (
+        covariance[:, step_bias.POTENTIAL] + at.pressure * covariance[:, step_bias.VOLUME]
+    )
+    of_enthalpy = at.count * with_enthalpy[0]
+    of_enthalpy += at.pressure * with_enthalpy[1] if at.has_barostat else 0.0
     capacity = 1e3 * (momenta + of_enthalpy / thermal / at.temperature) / at.moving
-    if not has_barostat:
+    if not at.has_barostat:
         return {"c_v (J/(mol K))": float(capacity)}
     return {
         "c_p (J/(mol K))": float(capacity),
-        "kappa_T (1/bar)": float(with_volume.volume / thermal / mean.volume * BAR_NM3),
-        "alpha_p (1/K)": float(with_enthalpy.volume / thermal / at.temperature / mean.volume),
+        "kappa_T (1/bar)": float(covariance[1, step_bias.VOLUME] / thermal / of.volume * BAR_NM3),
+        "alpha_p (1/K)": float(with_enthalpy[1] / thermal / at.temperature / of.volume),
     }
 
 
@@ -321,9 +221,8 @@ def _correlation(runs: Mapping[float, Sequence[RunResults]], names: list[str]) -
 
 def _next_terms(points: Mapping[str, list[MeanAtStep]], names: list[str], k: int) -> np.ndarray:
     """What terms of higher order may change in means and in slopes at step k."""
-    sizes = np.array([points[size_name(name)][k].mean for name in names])
-    square = points[MEAN_SQUARE][k]
-    return NEXT_TERM * square.mean * np.concatenate([square.timestep**2 * sizes, sizes])
+    rest = np.array([points[rest_name(name)][k].mean for name in names])
+    return np.concatenate([points[MEAN_SQUARE][k].timestep ** 2 * rest, rest])
 
 
 class _Step(NamedTuple):

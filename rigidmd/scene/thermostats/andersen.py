@@ -13,5 +13,8 @@ class Andersen(Thermostat):
     def defaults(self, stage: StageKeys) -> Values:
         return {"thermostat_time_ps": 1.0}
 
+    def rates(self, values: Values) -> tuple[float, float]:
+        return 1 / self.time(values), 1 / self.time(values)
+
 
 METHOD = Andersen()

@@ -28,6 +28,10 @@ class Langevin(Thermostat):
     def time(self, values: Values) -> float:
         return 1 / min(values.values())
 
+    def rates(self, values: Values) -> tuple[float, float]:
+        translation, rotation = values.values()
+        return 2 * translation, 2 * rotation
+
     def describe(self, values: Values) -> str:
         translation, rotation = values.values()
         also = f" ({rotation:g}/ps of rotation)" if rotation != translation else ""

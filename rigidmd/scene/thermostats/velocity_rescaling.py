@@ -15,5 +15,8 @@ class VelocityRescaling(Thermostat):
     def defaults(self, stage: StageKeys) -> Values:
         return {"thermostat_time_ps": 0.05}
 
+    def rates(self, values: Values) -> tuple[float, float]:
+        return 1 / self.time(values), 1 / self.time(values)
+
 
 METHOD = VelocityRescaling()

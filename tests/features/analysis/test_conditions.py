@@ -144,7 +144,7 @@ def test_what_is_missing_in_a_run_is_named():
     ):
         assert refused(name, open_space).startswith(f"{name} needs a box")
     for name in known():
-        if name not in ("response", "viscosity") and not known()[name].is_user:
+        if name not in ("response", "viscosity", "zero_step") and not known()[name].is_user:
             assert refused(name, frames[:1]).startswith(f"{name} needs the frames of a trajectory")
 
 

@@ -137,7 +137,7 @@ def test_the_list_is_that_of_all(capsys):
         cli.main(["analyse", "--list"])
     assert ended.value.code == 0
     listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
-    assert set(listed) == {*BUILT_IN, "insertion", "pmf", "free_energy"}  # the last two of a sweep
+    assert set(listed) == {*BUILT_IN, "insertion", "zero_step", "pmf", "free_energy"}
 
 
 def test_results_in_memory_and_from_the_folder_agree(water):

@@ -130,7 +130,8 @@ def _analyse(options: Options) -> int:
                 )
         if options.extrapolate is not None:
             raise OutputError(
-                f"--extrapolate needs a sweep over a time step, and {folder} is the folder of a run"
+                f"--extrapolate needs a sweep over a time step, and {folder} is the folder of a"
+                f" run: `rigidmd analyse {folder} zero_step` needs one run only"
             )
         done = analyse_folder(folder, *request, progress, options.figures, more)
     used = done.frames_used
