@@ -82,7 +82,7 @@ class Quantity:
         return self.of(observation) if self.of else getattr(observation, self.name)
 
 
-#: Whose kinetic energies add up.
+#: Motions of molecules, each with a kinetic energy and degrees of freedom.
 MOTIONS = ("translation", "rotation")
 
 

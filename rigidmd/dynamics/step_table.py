@@ -93,7 +93,7 @@ class StepTable:
             timing = Timing(flow.fraction, DRAWS * k, when)
             if flow.kind in (KICK, DRIFT):
                 rows += self._forces_of_kicks(group)
-                if k == self._kicks[0] < self._drifts[0] and not scheme.has_groups:
+                if k == self._kicks[0] < self._drifts[0] and self._has_curvature:
                     rows.append(power_row(parts))
                 if group is opening:
                     rows += [self._move(group, FIRST), self._move([*closing, *group], REPEATED)]
@@ -119,6 +119,12 @@ class StepTable:
             elif flow.kind == REMOVE_MOMENTUM:
                 rows.append(removal_row(parts, when))
         return rows
+
+    @property
+    def _has_curvature(self) -> bool:
+        """Whether a sample may need the curvature: averages of ensembles do, but not those of
+        trajectories that are accepted or rejected."""
+        return self._scheme.has_thermostat and not self._scheme.has_groups
 
     def _when(self, flow: Flow) -> int:
         """The steps in which a flow acts."""

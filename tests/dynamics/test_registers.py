@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.common import built, same_bits
 
+from rigidmd.assemble.build import integrator_of_stage
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.state import no_load
 from rigidmd.dynamics.observables import largest_values, sums_of_state
@@ -119,19 +120,28 @@ def flown(system, state, time):
     return other
 
 
-@pytest.mark.parametrize("scheme", ["velocity_verlet", "srkn_4"])
+def with_weak_thermostat(molecules, integrator):
+    """A system, its engine, its state, and an integrator whose thermostat hardly acts."""
+    stage = {"ensemble": "nvt", "temperature_K": 300.0, "thermostat_time_ps": 1e15}
+    stage |= {"duration_ps": 1.0, "integrator": integrator}
+    run = {"remove_momentum_interval_ps": False}
+    system, engine, state = built(molecules, 18.0, 3, stages=[stage], run=run)
+    return system, engine, state, integrator_of_stage(system, 0)
+
+
+@pytest.mark.parametrize("integrator", ["velocity_verlet", "baoab", "srkn_4"])
 @pytest.mark.parametrize("molecules", [{"spce": 6, "argon": 4, "nitrogen": 3}, {"argon": 9}])
-def test_the_curvature_is_the_second_derivative_along_free_motion(scheme, molecules):
+def test_the_curvature_is_the_second_derivative_along_free_motion(integrator, molecules):
     """Of the potential energy, in the middle of the last step, from two forces: compared with powers
     after free flights. The steps of a call do not depend on whether it is observed."""
-    system, engine, state = built(molecules, 18.0, 3)
-    plain, dt, steps = state.copy(), 1e-4, 7
-    engine.advance(state, SCHEMES[scheme], dt, steps - 1)
+    system, engine, state, scheme = with_weak_thermostat(molecules, integrator)
+    plain, whole, dt, steps = state.copy(), state.copy(), 1e-4, 7
+    engine.advance(state, scheme, dt, steps - 1)
     before = state.copy()
     engine.forget()
-    engine.advance(state, SCHEMES[scheme], dt, steps, observed=True)
+    engine.advance(state, scheme, dt, steps, observed=True)
     found = engine.sums(state, engine.evaluate_current(state)[0]).curvature
-    system.engine().advance(plain, SCHEMES[scheme], dt, steps)
+    system.engine().advance(plain, scheme, dt, steps)
     assert same_bits(plain, state)
     expected, h = [], 1e-5
     for one in (before, state):
@@ -140,16 +150,17 @@ def test_the_curvature_is_the_second_derivative_along_free_motion(scheme, molecu
     size = max(map(abs, expected))
     assert found == pytest.approx(np.mean(expected), rel=1e-3, abs=1e-3 * size)
     # of one call the same
-    whole = built(molecules, 18.0, 3)[2]
     engine = system.engine()
-    engine.advance(whole, SCHEMES[scheme], dt, steps, observed=True)
+    engine.advance(whole, scheme, dt, steps, observed=True)
     load = engine.evaluate_current(whole)[0]
     assert same_bits(whole, state)
     assert engine.sums(whole, load).curvature == found
 
 
-def test_the_curvature_is_unknown_where_a_step_begins_with_a_drift():
-    system, engine, state = built({"spce": 6}, 18.0, 3)
-    engine.advance(state, SCHEMES["position_verlet"], 1e-3, 5, observed=True)
+def test_the_curvature_is_unknown_without_a_thermostat_or_where_a_step_begins_with_a_drift():
+    system, engine, state, scheme = with_weak_thermostat({"spce": 6}, "position_verlet")
+    engine.advance(state, scheme, 1e-3, 5, observed=True)
     assert engine.sums(state, engine.evaluate_current(state)[0]) is None
+    engine.advance(state, SCHEMES["velocity_verlet"], 1e-3, 10, observed=True)
+    assert np.isnan(engine.sums(state, engine.evaluate_current(state)[0]).curvature)
     assert np.isnan(sums_of_state(system.model, state).curvature)

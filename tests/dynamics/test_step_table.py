@@ -22,10 +22,7 @@ FORCES = ["forces | without energies", f"{ENERGIES} | with energies"]
 LAST = "kick 0.5 dt | last"
 POWER = "power of the forces | before a sample"
 TABLES = {
-    "velocity Verlet": (
-        VERLET | {"ensemble": "nve"},
-        [FIRST[0], POWER, *FIRST[1:], *REPEATED, *FORCES, LAST],
-    ),
+    "velocity Verlet": (VERLET | {"ensemble": "nve"}, [*FIRST, *REPEATED, *FORCES, LAST]),
     "langevin with cell rescaling": (
         NPT | {"thermostat": "langevin", "barostat": "cell_rescaling"},
         [
@@ -61,7 +58,6 @@ TABLES = {
         [
             "forces and virials | first",
             "barostat Piston 0.5 dt: kick of the volume",
-            POWER,
             "kick 0.5 dt",
             "drift of the volume 0.5 dt",
             "drift 1 dt",
@@ -77,7 +73,6 @@ TABLES = {
         {"ensemble": "nve", "integrator": "chin_4a"},
         [
             "forces | first",
-            POWER,
             "kick 0.1667 dt, drift 0.5 dt | first",
             "kick 0.1667 dt, kick 0.1667 dt, drift 0.5 dt | repeated",
             "forces",

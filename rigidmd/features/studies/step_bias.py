@@ -293,7 +293,7 @@ def bias_of(
     return Bias(factor * found.value, factor * scatter, factor * np.hypot(next_term, found.missed))
 
 
-class Measured(NamedTuple):
+class Production(NamedTuple):
     """The samples of the production of a run, and its conditions."""
 
     at: Conditions
@@ -301,7 +301,7 @@ class Measured(NamedTuple):
     columns: dict[str, np.ndarray]
 
 
-def measured(system: System, stage: Stage, columns: Mapping[str, np.ndarray]) -> Measured | str:
+def production(system: System, stage: Stage, columns: Mapping[str, np.ndarray]) -> Production | str:
     """The samples of a stage, or why the bias of its means is not known."""
     at = conditions(system, stage)
     if isinstance(at, str):
@@ -320,7 +320,7 @@ def measured(system: System, stage: Stage, columns: Mapping[str, np.ndarray]) ->
     potential = _centred(series.potential)
     if not len(potential) >= max(2 * BLOCKS, LEAST_SAMPLES * inefficiency(potential)):
         return f"the run has fewer than {LEAST_SAMPLES:g} independent samples"
-    return Measured(at, series, dict(columns))
+    return Production(at, series, dict(columns))
 
 
 def beyond_first_order(series: Series, at: Conditions) -> str:
@@ -346,12 +346,12 @@ def biases(
 ) -> dict[str, tuple[float, float, float]] | str:
     """Means of columns of the log less those at a step of zero, their errors, and the errors of the
     means at zero, by name, or why they are not known."""
-    run = measured(system, stage, columns)
+    run = production(system, stage, columns)
     return run if isinstance(run, str) else biases_of(run, system.quantities)
 
 
 def biases_of(
-    run: Measured, quantities: Mapping[str, Quantity]
+    run: Production, quantities: Mapping[str, Quantity]
 ) -> dict[str, tuple[float, float, float]]:
     """The same of the samples of a run."""
     names, values, gradients, of_momenta = [], [], [], []
@@ -379,7 +379,7 @@ def biases_of(
     return found
 
 
-def kinetic_part(quantity: Quantity, run: Measured) -> np.ndarray:
+def kinetic_part(quantity: Quantity, run: Production) -> np.ndarray:
     """The kinetic energy (l,) in a quantity of the log, less its mean at a step of zero for the
     same positions."""
     at, series = run.at, run.series

@@ -14,7 +14,7 @@ from rigidmd.features.analysis.registry import built_in
 from rigidmd.features.analysis.result import AnalysisResult, Curve, Value
 from rigidmd.features.analysis.rigid_frames import RigidFrames
 from rigidmd.features.analysis.runs import Runs
-from rigidmd.features.studies.step_bias import BLOCKS, Measured, bias_of, biases_of, measured
+from rigidmd.features.studies.step_bias import BLOCKS, Production, bias_of, biases_of, production
 
 #: Most frames for curves, and fewest.
 MOST_FRAMES, LEAST_FRAMES = 2000, 20 * BLOCKS
@@ -69,11 +69,11 @@ def zero_step(
     return result
 
 
-def _measured(run: RigidFrames) -> Measured:
+def _production(run: RigidFrames) -> Production:
     """The samples of the last stage. Raises OutputError."""
-    of_stage = run.columns["stage"] == run.system.scene.stages.index(run.stage)
+    of_stage = run.columns["stage"] == run.columns["stage"][-1]
     columns = {name: values[of_stage] for name, values in run.columns.items()}
-    found = measured(run.system, run.stage, columns)
+    found = production(run.system, run.stage, columns)
     if isinstance(found, str):
         raise OutputError(f"zero_step: {found}")
     return found
@@ -81,7 +81,7 @@ def _measured(run: RigidFrames) -> Measured:
 
 def _of_run(run: RigidFrames) -> dict[str, tuple[float, float, float, float]]:
     """Mean, bias, its error and the error of the mean at zero, by columns. Raises OutputError."""
-    samples = _measured(run)
+    samples = _production(run)
     found = {}
     for name, of_column in biases_of(samples, run.system.quantities).items():
         found[name] = float(samples.columns[name].mean()), *of_column
@@ -90,7 +90,7 @@ def _of_run(run: RigidFrames) -> dict[str, tuple[float, float, float, float]]:
 
 def _add_curves(result: AnalysisResult, run: RigidFrames, axis: str | None) -> None:
     """g(r), and a density profile, without time-step error. A note where there are none."""
-    at = _measured(run)
+    at = _production(run)
     if not np.isfinite(at.series.curvature).all():
         result.notes.append("no pressure and no g(r), as the log has no v U'' v of all steps")
         return
@@ -124,7 +124,7 @@ def _unchecked(analysis):
     return analysis.__wrapped__
 
 
-def _corrected(frames: list[Curve], at: Measured, rows: np.ndarray) -> Curve:
+def _corrected(frames: list[Curve], at: Production, rows: np.ndarray) -> Curve:
     """The mean of curves of single frames less the bias by the step."""
     first = frames[0]
     curve = Curve(f"zero_step_{first.file}", first.axis, first.label, {}, level=first.level)

@@ -9,6 +9,7 @@ from rigidmd import Simulation
 from rigidmd.commands.cli import main
 from rigidmd.errors import OutputError
 from rigidmd.features.studies import step_bias
+from rigidmd.run.report import short_summary
 
 STEP = 25.0  # fs
 
@@ -52,11 +53,42 @@ def test_all_means_and_g_of_a_run(nitrogen, capsys):
     assert np.all(np.abs(g[:20]) < 1e-9)
     assert g.max() > 1.5
     raw = rigidmd.analysis.rdf(results)["g N-N"]
-    assert g + of_step == pytest.approx(raw, abs=0.2 * raw.max())
+    assert g + of_step == pytest.approx(raw, abs=1e-9)  # of the same frames
+    uncertain = found.curves[0].errors["g N-N"]
+    assert 0 < np.abs(of_step).max() < 0.1
+    assert (uncertain[raw > 0] > 0).all()
     assert main(["analyse", str(nitrogen), "zero_step", "curves=false"]) == 0
     text = capsys.readouterr().out
     assert "Potential Energy per molecule" in text
     assert "the step added" in text
+
+
+def test_the_summary_prints_the_step_where_it_matters(nitrogen):
+    """From a third of the statistical error on, if it is twice its own error."""
+    summary = rigidmd.read_run(nitrogen).summary
+    keys = [f"potential_{key}_kJ_mol_per_molecule" for key in ("error", "step", "step_error")]
+    stage = summary["stages"][-1]
+    for error, bias, uncertain, shown in [
+        (0.01, 0.004, 0.001, True),
+        (0.01, -0.004, 0.001, True),
+        (0.01, 0.003, 0.001, False),
+        (0.01, 0.004, 0.003, False),
+    ]:
+        stage |= dict(zip(keys, (error, bias, uncertain), strict=True))
+        line = next(x for x in short_summary(summary).splitlines() if "potential energy" in x)
+        assert (f"± 0.010, step {bias:+g}" in line) is shown, (bias, uncertain)
+        assert ("step" in line) is shown
+
+
+def test_a_density_profile_is_corrected_too(nitrogen):
+    found = rigidmd.analysis.zero_step(rigidmd.read_run(nitrogen), axis="z")
+    assert [curve.file for curve in found.curves] == ["zero_step_rdf", "zero_step_density_profile"]
+    density, of_step = (
+        found.curves[1].columns[f"density nitrogen (g/cm3){end}"] for end in ("", ", of the step")
+    )
+    # the mass is the same at any step
+    assert density.mean() == pytest.approx(0.75, rel=1e-4)
+    assert of_step.mean() == pytest.approx(0.0, abs=1e-9)
 
 
 def test_several_runs_have_smaller_errors(nitrogen):
