@@ -426,7 +426,7 @@ def test_water_in_water_has_the_published_free_energy(tmp_path, monkeypatch, cap
     """-7.05 kcal/mol (Wang et al. 2009, table 3), within 0.1 kcal/mol and the error; the scene of
     the guide."""
     monkeypatch.chdir(tmp_path)
-    guide = (ROOT / "rigidmd/docs/guides/chemical_potential.md").read_text(encoding="utf-8")
+    guide = (ROOT / "rigidmd/docs/guides/free_energies.md").read_text(encoding="utf-8")
     scene = guide.partition("file hydration.toml -->\n```toml\n")[2].partition("```")[0]
     (tmp_path / "hydration.toml").write_text(scene)
     values = "0,0.1,0.2,0.3,0.5,0.625,0.75,0.875,1"
