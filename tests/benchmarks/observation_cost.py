@@ -1,7 +1,7 @@
 """What observations cost: steps per second of a run with its default output, relative to the engine
 alone.
 
-    python tests/benchmarks/looks.py --workloads 216,W1,W2,W3 --rounds 5
+    python tests/benchmarks/observation_cost.py --workloads 216,W1,W2,W3 --rounds 5
 
 Both move the same start at constant energy in steps of 2 fs, in one process: the engine takes half
 of its steps before each run and half of them after it, in one piece as in peers.py. The run is that
