@@ -1,39 +1,38 @@
-"""Hook of MkDocs: the reference of the Python interface, from the docstrings of the package."""
+"""The reference of the Python interface in Markdown, from annotations and docstrings."""
 
 import functools
 import html
 import inspect
 import re
 import textwrap
+from collections.abc import Callable
 from importlib import import_module
 
 from rigidmd import PACKAGES
 
-#: Module -> names in their order; empty for all public names.
-MODULES = {
-    "rigidmd": (),
-    "rigidmd.view": (),
-    "rigidmd.analysis": (),
-    "rigidmd.ase": (),
-    "rigidmd.errors": (
-        "RigidMDError",
-        "InputError",
-        "SceneError",
-        "MoleculeError",
-        "StructureError",
-        "OutputError",
-        "CheckpointError",
-        "SimulationError",
-        "EngineError",
-        "RigidMDWarning",
-    ),
-    "rigidmd.features.analysis.result": ("AnalysisResult", "Value", "Curve"),
-    "rigidmd.features.studies.normal_modes": ("NormalModes",),
-    "rigidmd.features.studies.sweep.table": ("Table",),
-    "rigidmd.engines.observables": ("Observation",),
-    "rigidmd.features.bodies.system": ("Pose",),
-    "rigidmd.core.state": ("State",),
-}
+ERRORS = (
+    "RigidMDError InputError SceneError MoleculeError StructureError OutputError CheckpointError"
+    " SimulationError EngineError RigidMDWarning"
+)
+#: Title, module, public names in the order that a script needs. Names that are not listed follow in
+#: the next section of the module without names.
+SECTIONS = (
+    ("rigidmd", "rigidmd", "Scene Simulation Results read_run Every sweep"),
+    ("rigidmd.analysis", "rigidmd.analysis", ""),
+    ("rigidmd.view", "rigidmd.view", ""),
+    ("More of rigidmd", "rigidmd", ""),
+    ("rigidmd.ase", "rigidmd.ase", ""),
+    ("rigidmd.errors", "rigidmd.errors", ERRORS),
+    ("Results of analyses", "rigidmd.features.analysis.result", "AnalysisResult Value Curve"),
+    ("Normal modes", "rigidmd.features.studies.normal_modes", "NormalModes"),
+    ("The table of a sweep", "rigidmd.features.studies.sweep.table", "Table"),
+    ("Observables", "rigidmd.engines.observables", "Observation"),
+    ("The state of molecules", "rigidmd.core.state", "State"),
+    ("The state of a body", "rigidmd.features.bodies.system", "Pose"),
+)
+#: Classes that users do not create: functions return them.
+RETURNED = "Results Moment PairPotential BodyPairPotential AnalysisResult Value Curve NormalModes"
+RETURNED = {*RETURNED.split(), "Table", "Observation", "State", "Pose"}
 PROPERTIES = (property, functools.cached_property)
 DESCRIPTORS = (*PROPERTIES, classmethod, staticmethod)
 KEYWORD = inspect.Parameter.KEYWORD_ONLY
@@ -42,27 +41,20 @@ SECTION = re.compile(r"^(Parameters|Returns|Raises|Examples)\n-+\n", re.MULTILIN
 ENTRY = re.compile(r"^(?=\S)", re.MULTILINE)
 
 
-def on_files(files, config):
-    from mkdocs.structure.files import File  # the tests read `page` without MkDocs
-
-    files.append(File.generated(config, "reference/api.md", content=page()))
-    return files
-
-
 def page() -> str:
     """The page in Markdown."""
     parts = [
         "# API reference",
-        "This page lists every public class and function with its docstring."
-        " [Python](python.md) is a shorter overview. The modules after `rigidmd.errors` define what"
-        " these functions return. You do not import them.",
+        "Public classes and functions with their docstrings. [Python](python.md) is a shorter"
+        " overview.",
     ]
-    for name, names in MODULES.items():
+    listed = set()
+    for title, name, names in SECTIONS:
         short = name.removeprefix("rigidmd.")
         module = import_module(f"rigidmd.features.{PACKAGES[short]}" if short in PACKAGES else name)
-        title, _, _ = (module.__doc__ or "").partition("\n\n")
-        parts += [f"## {name}", _text(" ".join(title.split()))]
-        for public in names or sorted(module.__all__):
+        parts += [f"## {title}", *(_docstring(module.__doc__ or "") if title == name else [])]
+        for public in names.split() or sorted(set(module.__all__) - listed):
+            listed.add(public)
             member = getattr(module, public)
             if callable(member):
                 parts += _entry("###", public, member)
@@ -84,17 +76,23 @@ def _members(name: str, kind: object) -> list[str]:
 
 def _entry(rank: str, name: str, member: object) -> list[str]:
     """Heading, signature and docstring of a class, function or property."""
-    kind = "class " if inspect.isclass(member) else ""
-    doc = inspect.getdoc(member) or ""
-    if isinstance(member, functools.cached_property):
-        doc = inspect.getdoc(member.func) or ""
+    _, dot, last = name.rpartition(".")
+    heading = f'{rank} `{name}` {{ data-toc-label="{dot}{last}" }}'
     if isinstance(member, PROPERTIES):
-        return [f"{rank} `{name}`", "*property*", *_docstring(doc)]
-    return [
-        f"{rank} `{name}`",
-        f"```python\n{kind}{name}{_signature(member)}\n```",
-        *_docstring(doc),
-    ]
+        function = member.func if isinstance(member, functools.cached_property) else member.fget
+        line, member = f"{name}{_returned(function, ': ')}", function
+    else:
+        kind = "class " if inspect.isclass(member) else ""
+        line = f"{kind}{name}{'' if name in RETURNED else _signature(member)}"
+    return [heading, f"```python\n{line}\n```", *_docstring(inspect.getdoc(member) or "")]
+
+
+def _returned(function: Callable, sign: str) -> str:
+    """The annotation of what a function returns, after `sign`."""
+    returned = inspect.signature(function).return_annotation
+    if returned in (inspect.Signature.empty, None):
+        return ""
+    return sign + _without_modules(inspect.formatannotation(returned))
 
 
 def _signature(member: object) -> str:
@@ -117,9 +115,7 @@ def _signature(member: object) -> str:
     keywords = [k for k, each in enumerate(signature.parameters.values()) if each.kind == KEYWORD]
     if keywords and keywords[0] < len(arguments):
         arguments.insert(keywords[0], "*")
-    returned = signature.return_annotation
-    is_silent = is_class or returned in (inspect.Signature.empty, None)
-    end = "" if is_silent else " -> " + _without_modules(inspect.formatannotation(returned))
+    end = "" if is_class else _returned(function, " -> ")
     line = f"({', '.join(arguments)}){end}"
     if len(line) < WIDTH:
         return line

@@ -739,15 +739,3 @@ def test_a_simulation_shows_what_is_for_users():
     simulation = Simulation(ROOT / "systems" / "heavy_top_3.toml")
     assert {name for name in vars(simulation) if not name.startswith("_")} == {"folder"}
     assert set(dir(rigidmd.analysis)) == set(rigidmd.analysis.__all__)
-
-
-def test_the_reference_has_class_methods_cached_properties_and_code(monkeypatch):
-    monkeypatch.syspath_prepend(ROOT / ".ci" / "site")
-    import api
-
-    page = api.page()
-    for name in ("Scene.read", "Scene.from_dict", "Moment.observation", "Results.rotation"):
-        assert f"#### `{name}`" in page
-    assert "```python\nclass Spring(rigidmd.Force):\n    def on_molecules" in page
-    assert page.count("**Examples**") >= 9
-    assert " at 0x" not in page  # of default values
