@@ -1,28 +1,7 @@
 """README and the chapters: every command and snippet in them runs, every key and column is in the
 manual, no link is dead.
 
-A comment before a block shows this file how to treat it:
-
-    <!-- test: file NAME -->       the block is the file NAME, which later commands use
-    <!-- test: end of NAME -->     it is added to the file NAME
-    <!-- test: with OPTIONS -->    OPTIONS are added to each command of the block that runs a scene (those in LONG), and
-                                   those of --set to each `Scene.read` of a Python block: shorter runs. KEY=VALUE alone
-                                   is added to each `rigidmd analyse`
-    <!-- test: not run, WHY -->    commands are parsed, and their scenes read, but not run. Commands with the same options
-                                   run elsewhere: on another page, or in a test of ELSEWHERE
-    <!-- test: output of CMD -->   every line of the block is in the output of CMD, in this order. CMD runs with the options
-                                   of the document where it is one of its commands, else as it
-                                   stands
-    <!-- test: output like CMD --> the same, but each number may be any number, with any spaces
-                                   before it, and a line may be longer: the block is of a longer
-                                   run, another machine or version of another program
-    <!-- output: WHERE -->         the block is not compared: WHERE has the version, the command and the machine that made it
-    <!-- test: not output, WHY --> the block is a text that no command prints
-
-In quoted output `...` stands for any text, a line of it for any lines, and a number below 1e-9 for
-any such number: it is a rounding error. Every quoted output has one of these comments.
-
-Commands and snippets of a document run in their order, in one folder that has a copy of systems/.
+tests/support/documents.py describes the comments before blocks. Commands and snippets of a document run in their order, in one folder that has a copy of systems/.
 """
 
 import argparse
@@ -37,11 +16,22 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 from pydantic import BaseModel
 from support.common import ROOT
+from support.documents import (
+    DOCUMENTS,
+    PAGES,
+    README,
+    Block,
+    blocks_of,
+    commands_of,
+    new_scenes,
+    output_of,
+    pattern_of,
+    write_files,
+)
 
 from rigidmd.commands import cli
 from rigidmd.commands.arguments import read_scene
@@ -53,12 +43,6 @@ from rigidmd.run.kind import resolve
 from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override
 from rigidmd.scene.models import read_parameters
 
-README = ROOT / "README.md"
-#: The chapters of this checkout; those of an installed package may be elsewhere.
-PAGES = {
-    name: ROOT / "rigidmd" / "docs" / path.relative_to(DOCS) for name, path in CHAPTERS.items()
-}
-DOCUMENTS = [README, *PAGES.values()]
 MANUAL = "\n".join(
     path.read_text(encoding="utf-8") for path in PAGES.values() if path.parent.name == "reference"
 )
@@ -88,71 +72,6 @@ MINIMAL = {
 }
 
 
-class Block(NamedTuple):
-    """A fenced block, or the indented lines that README starts with."""
-
-    line: int  # of its first line of text
-    language: str
-    text: str
-    told: str  # what the comment before it shows this test
-
-
-def blocks_of(document: Path) -> list[Block]:
-    lines = document.read_text(encoding="utf-8").splitlines()
-    found, told, k = [], "", 0
-    while k < len(lines):
-        line = lines[k]
-        if marker := re.fullmatch(r"<!-- (test|output): (.*) -->", line):
-            told = marker[2] if marker[1] == "test" else f"recorded {marker[2]}"
-            assert lines[k + 1].startswith(("```", "|")), (
-                f"{document.name}:{k + 1}: a block or a table must follow at once"
-            )
-        elif line.startswith("|"):
-            told = ""
-        elif line.startswith("```"):
-            end = lines.index("```", k + 1)
-            found.append(Block(k + 2, line[3:], "\n".join(lines[k + 1 : end]), told))
-            told, k = "", end
-        elif re.match(r" {4}\S", line) and not lines[k - 1]:
-            end = next(n for n in range(k, len(lines)) if not lines[n].startswith("    "))
-            found.append(
-                Block(k + 1, "sh", "\n".join(line[4:] for line in lines[k:end]), "not run, by CI")
-            )
-            k = end - 1
-        k += 1
-    return found
-
-
-def commands_of(text: str) -> list[list[str]]:
-    """The words of each command of a shell block, comments omitted."""
-    joined = text.replace("\\\n", " ")
-    return [
-        shlex.split(part, comments=True)
-        for line in joined.splitlines()
-        for part in line.split("&&")
-    ]
-
-
-NUMBER = r"[+-]?\d[\d,.]*(?:e[+-]?\d+)?"
-ROUNDING = r"\d(?:\.\d+)?e-[1-9]\d|0\.0e\+00"
-
-
-def pattern_of(quoted: str, like: bool) -> re.Pattern:
-    """What a quoted line of output stands for; with `like`, of any numbers."""
-
-    def form(part: str) -> str:
-        if part == "...":
-            return ".*"
-        if like and part.isspace():
-            return r"\s*"
-        if re.fullmatch(ROUNDING, part) and not like:
-            return f"(?:{ROUNDING})"
-        return NUMBER if like and re.fullmatch(NUMBER, part) else re.escape(part)
-
-    parts = re.split(rf"(\.\.\.|\s+|{ROUNDING}|{NUMBER})", quoted)
-    return re.compile("".join(map(form, parts)) + (".*" if like else r"\s*"))
-
-
 def changed(arguments: list[str], options: list[str]) -> list[str]:
     """Arguments with further options. Those of --set replace values of the same keys."""
     new = {word.partition("=")[0] for word in options}
@@ -175,16 +94,12 @@ class Reader:
         self.printed: dict[str, str] = {}  # by the commands so far
 
     def follow(self, block: Block) -> None:
-        how, _, rest = block.told.partition(" ")
-        assert how in ("", "file", "with", "end", "not", "output", "recorded"), block.told
-        assert block.told or block.language != "text" or "±" not in block.text, (
+        how, _, rest = block.about.partition(" ")
+        assert how in ("", "file", "with", "end", "not", "output", "recorded"), block.about
+        assert block.about or block.language != "text" or "±" not in block.text, (
             "quoted output must have its command"
         )
-        if how == "file":
-            Path(rest).write_text(block.text + "\n", encoding="utf-8")
-        if how == "end":
-            name = rest.removeprefix("of ")
-            Path(name).write_text(f"{Path(name).read_text()}\n{block.text}\n", encoding="utf-8")
+        write_files([block], Path())
         options = shlex.split(rest) if how == "with" else []
         if block.language == "sh":
             for words in commands_of(block.text):
@@ -194,13 +109,12 @@ class Reader:
         elif block.language == "python" and how != "file":
             self.python(block, options)
         elif how == "output":
-            kind, _, command = rest.partition(" ")
-            assert kind in ("of", "like"), block.told
-            self.output(command, block.text, kind == "like")
+            quoted = output_of(block)
+            assert quoted.kind in ("of", "like"), block.about
+            self.output(quoted.commands[0], block.text, quoted.kind == "like")
 
-    def output(self, command: str, text: str, like: bool) -> None:
+    def output(self, words: list[str], text: str, like: bool) -> None:
         """Every line of a block must be in the output of a command, in this order."""
-        words = shlex.split(command)
         if shlex.join(words) not in self.printed:
             self.command(words, [], runs=True)
         printed = self.printed[shlex.join(words)]
@@ -345,6 +259,66 @@ def test_what_a_document_describes_can_be_done(
         assert {_first_of_its_kind(column) for column in header} <= named
 
 
+DURATION_AND_STEP = re.compile(
+    r"([\d.,]+) ps at ([\d.]+) fs|([\d,]+) steps of ([\d.]+) (?:fs|s)\\b"
+)
+
+
+def quoted_segments(text: str) -> set[tuple[float, float]]:
+    """(number of steps, time step) that a quoted output has: of molecules in fs, of a body in s."""
+    numbers = [
+        [each and float(each.replace(",", "")) for each in found.groups()]
+        for found in DURATION_AND_STEP.finditer(text)
+    ]
+    return {
+        (round(duration * 1e3 / short), short) if duration else (count, step)
+        for duration, short, count, step in numbers
+    }
+
+
+def segments_of(scene: Scene) -> set[tuple[float, float]]:
+    """The same of a scene."""
+    if isinstance(scene, BodyScene):
+        return {(round(scene.run.duration_s / scene.run.timestep_s), scene.run.timestep_s)}
+    return {
+        (round(stage.duration_ps * 1e3 / stage.timestep_fs), stage.timestep_fs)
+        for stage in scene.stages
+        if stage.duration_ps
+    }
+
+
+def integrators_of(scene: Scene) -> set[str]:
+    stages = [scene.run] if isinstance(scene, BodyScene) else scene.stages
+    return {stage.integrator for stage in stages}
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.stem)
+def test_recorded_output_is_of_the_scene_with_the_defaults_of_today(
+    document, tmp_path, monkeypatch, capsys
+):
+    """Numbers of steps, time steps and integrators, which are known without a run."""
+    shutil.copytree(ROOT / "systems", tmp_path / "systems")
+    monkeypatch.chdir(tmp_path)
+    blocks = blocks_of(document)
+    for k, block in enumerate(blocks):
+        quoted = output_of(block)
+        if quoted is None or not quoted.where:
+            continue
+        write_files(blocks[:k], tmp_path)
+        for words in new_scenes(blocks[:k]):
+            cli.main([*words[1:], "--force"])
+        runs = [parse(words[1:]) for words in quoted.commands]
+        scenes = [
+            resolve(read_scene(options))
+            for options, words in zip(runs, quoted.commands, strict=True)
+            if words[1] == "run"
+        ]
+        if scenes:
+            assert quoted_segments(block.text) <= set().union(*map(segments_of, scenes))
+            named = set(re.findall(r"\w+", block.text)) & set(SCHEMES)
+            assert named <= set().union(*map(integrators_of, scenes))
+
+
 def form_of(words: list[str]) -> tuple[str, ...]:
     """A command and its options, without their values."""
     return (words[1], *sorted({word for word in words if re.match(r"--?[a-z]", word)}))
@@ -356,7 +330,7 @@ def test_every_command_on_a_page_runs():
     for document in DOCUMENTS:
         for block in (block for block in blocks_of(document) if block.language == "sh"):
             for words in (words for words in commands_of(block.text) if words[:1] == ["rigidmd"]):
-                if block.told.startswith("not run"):
+                if block.about.startswith("not run"):
                     others[form_of(words)] = f"{document.name}:{block.line}"
                 else:
                     runs.add(form_of(words))
