@@ -63,13 +63,14 @@ def page() -> str:
 
 
 def _members(name: str, kind: object) -> list[str]:
-    """Entries of the public methods and properties of a class."""
+    """Entries of the public methods and properties of a class that its bases do not have."""
     if not inspect.isclass(kind) or issubclass(kind, Exception):
         return []
     parts = []
+    shown = set(dir(kind)).difference(*(dir(base) for base in kind.__bases__))
     for member, value in vars(kind).items():
-        is_shown = inspect.isfunction(value) or isinstance(value, DESCRIPTORS)
-        if is_shown and not member.startswith(("_", "model_")) and inspect.getdoc(value):
+        is_method = inspect.isfunction(value) or isinstance(value, DESCRIPTORS)
+        if is_method and member in shown and not member.startswith("_") and inspect.getdoc(value):
             parts += _entry("####", f"{name}.{member}", value)
     return parts
 

@@ -36,6 +36,14 @@ WITH_PICTURE = ("intermediate_axis", "dry_ice")
 WITH_KEYS = ("scene.md", "body.md")
 #: A list of all pages, for those who read the files. The site has a navigation.
 LISTED = "contents"
+#: Weights in a search by folder: what to do comes before how it was measured.
+WEIGHTS = {"start": 2, "tutorials": 2, "guides": 2, "evidence": 0.5, "project": 0.25}
+#: Other words for what a page is about.
+SYNONYMS = {
+    "resume": ["continue", "restart"],
+    "slab": ["surface tension"],
+    "tables": ["own potential", "custom potential", "user-defined potential"],
+}
 HEADING_OR_KEY = re.compile(r"^##+ (?P<heading>.+)$|^\| `(?P<key>\w+)`", re.MULTILINE)
 CODE_OR_COMMENT = re.compile(
     r"^( *```+).*?^\1$|(?<!`)(`+)(?!`)(?:(?!\n\n).)+?(?<!`)\2(?!`)|<!--.*?-->",
@@ -62,9 +70,11 @@ def main() -> None:
     for name in LIVE:
         write_live(name, docs / "live", is_empty=arguments.without_live)
     for path in docs.rglob("*.md"):
-        path.write_text(page(path, path.read_text(encoding="utf-8")), encoding="utf-8")
+        text = page(path, path.read_text(encoding="utf-8"))
+        header = f"---\n{json.dumps(settings(path))}\n---\n"  # JSON is YAML
+        path.write_text(header + text, encoding="utf-8")
     theme = (SITE / "theme.yml").read_text(encoding="utf-8")
-    config = f"{theme}nav: {json.dumps(navigation())}\n"  # JSON is YAML
+    config = f"{theme}nav: {json.dumps(navigation())}\n"
     (arguments.folder / "mkdocs.yml").write_text(config, encoding="utf-8")
 
 
@@ -106,7 +116,17 @@ def page(path: Path, text: str) -> str:
     text = CODE_OR_COMMENT.sub(store, text)
     text = LINK.sub(link, EQUATION.sub(equation, text))
     text = re.sub("\0(\\d+)\0", lambda found: code[int(found[1])], text)
-    return f"---\nsearch:\n  exclude: true\n---\n{text}" if path.stem == LISTED else text
+    return text
+
+
+def settings(path: Path) -> dict:
+    """Settings of a page: its sidebars, and its weight and further words in a search."""
+    if path.stem == "index":
+        return {"hide": ["navigation", "toc"]}
+    if path.stem == LISTED:
+        return {"search": {"exclude": True}}
+    weight = 0.5 if path.stem == "api" else WEIGHTS.get(path.parent.name, 1)
+    return {"search": {"boost": weight}, "tags": SYNONYMS.get(path.stem, [])}
 
 
 def with_key_anchors(text: str) -> str:
