@@ -7,6 +7,7 @@ import re
 import textwrap
 from collections.abc import Callable
 from importlib import import_module
+from types import FunctionType
 
 from rigidmd import PACKAGES
 
@@ -31,13 +32,14 @@ SECTIONS = (
     ("The state of a body", "rigidmd.features.bodies.system", "Pose"),
 )
 #: Classes that users do not create: functions return them.
-RETURNED = "Results Moment PairPotential BodyPairPotential AnalysisResult Value Curve NormalModes"
-RETURNED = {*RETURNED.split(), "Table", "Observation", "State", "Pose"}
+RETURNED = (
+    "Scene MolecularScene BodyScene Results Moment PairPotential BodyPairPotential AnalysisResult"
+    " Value Curve NormalModes Table Observation State Pose"
+)
 PROPERTIES = (property, functools.cached_property)
-DESCRIPTORS = (*PROPERTIES, classmethod, staticmethod)
 KEYWORD = inspect.Parameter.KEYWORD_ONLY
-WIDTH = 72  # characters of a signature on one line
-SECTION = re.compile(r"^(Parameters|Returns|Raises|Examples)\n-+\n", re.MULTILINE)
+WIDTH = 72  # characters of a signature in a heading
+SECTION = re.compile(r"^(Parameters|Attributes|Returns|Raises|Examples)\n-+\n", re.MULTILINE)
 ENTRY = re.compile(r"^(?=\S)", re.MULTILINE)
 
 
@@ -63,29 +65,37 @@ def page() -> str:
 
 
 def _members(name: str, kind: object) -> list[str]:
-    """Entries of the public methods and properties of a class that its bases do not have."""
+    """Entries of the methods and properties of a class that its bases do not have."""
     if not inspect.isclass(kind) or issubclass(kind, Exception):
         return []
-    parts = []
     shown = set(dir(kind)).difference(*(dir(base) for base in kind.__bases__))
-    for member, value in vars(kind).items():
-        is_method = inspect.isfunction(value) or isinstance(value, DESCRIPTORS)
-        if is_method and member in shown and not member.startswith("_") and inspect.getdoc(value):
-            parts += _entry("####", f"{name}.{member}", value)
-    return parts
+    kinds = (classmethod, FunctionType, *PROPERTIES)
+    members = [
+        (kinds.index(type(value)), f"{name}.{member}", value)
+        for member, value in vars(kind).items()
+        if type(value) in kinds
+        and member in shown
+        and not member.startswith("_")
+        and inspect.getdoc(value)
+    ]
+    members.sort(key=lambda item: item[0])
+    return [part for _, member, value in members for part in _entry("####", member, value)]
 
 
 def _entry(rank: str, name: str, member: object) -> list[str]:
-    """Heading, signature and docstring of a class, function or property."""
-    _, dot, last = name.rpartition(".")
-    heading = f'{rank} `{name}` {{ data-toc-label="{dot}{last}" }}'
+    """Heading with signature, and docstring, of a class, function or property. A long signature
+    stands below the heading."""
     if isinstance(member, PROPERTIES):
-        function = member.func if isinstance(member, functools.cached_property) else member.fget
-        line, member = f"{name}{_returned(function, ': ')}", function
+        member = member.func if isinstance(member, functools.cached_property) else member.fget
+        signature = _returned(member, ": ")
     else:
-        kind = "class " if inspect.isclass(member) else ""
-        line = f"{kind}{name}{'' if name in RETURNED else _signature(member)}"
-    return [heading, f"```python\n{line}\n```", *_docstring(inspect.getdoc(member) or "")]
+        signature = "" if name in RETURNED.split() else _signature(member)
+    title, block = name + signature, []
+    if len(title) > WIDTH:
+        title, block = name, [f"```python\n{name}{signature}\n```"]
+    _, dot, last = name.rpartition(".")
+    heading = f'{rank} `{title}` {{ #{name} data-toc-label="{dot}{last}" }}'
+    return [heading, *block, *_docstring(inspect.getdoc(member) or "")]
 
 
 def _returned(function: Callable, sign: str) -> str:
@@ -102,19 +112,14 @@ def _signature(member: object) -> str:
     if is_class and issubclass(member, Exception):
         return ""
     function = getattr(member, "__func__", member)
-    try:
-        signature = inspect.signature(function)
-    except ValueError:
-        return "(...)"
-    # scenes have the arguments **data of pydantic: they are read from files
-    hidden = {"self", "cls", *(["data"] if is_class else [])}
-    arguments = [
-        _without_modules(str(each))
-        for name, each in signature.parameters.items()
-        if name not in hidden and not name.startswith("_")
+    parameters = [
+        each
+        for name, each in inspect.signature(function).parameters.items()
+        if name not in ("self", "cls") and not name.startswith("_")
     ]
-    keywords = [k for k, each in enumerate(signature.parameters.values()) if each.kind == KEYWORD]
-    if keywords and keywords[0] < len(arguments):
+    arguments = [_without_modules(str(each)) for each in parameters]
+    keywords = [k for k, each in enumerate(parameters) if each.kind == KEYWORD]
+    if keywords:
         arguments.insert(keywords[0], "*")
     end = "" if is_class else _returned(function, " -> ")
     line = f"({', '.join(arguments)}){end}"
@@ -126,7 +131,8 @@ def _signature(member: object) -> str:
 def _without_modules(text: str) -> str:
     text = re.sub(r"<(?:function [^>]*(?:>[^>]*)?|factory)>", "...", text)
     text = re.sub(r"\b(?:rigidmd|collections|typing|pathlib|numpy|pandas)\.(?:\w+\.)*|~", "", text)
-    return re.sub(r"'(?=\w*[A-Z])([^']*)'", r"\1", text)
+    text = re.sub(r"\b(Scene|System)T\b", r"\1", text)
+    return re.sub(r"'(?=[\w.]*[A-Z])([^']*)'", r"\1", text)
 
 
 def _docstring(doc: str) -> list[str]:
