@@ -14,6 +14,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from os.path import normpath
 from pathlib import Path
 
 import api
@@ -70,7 +71,7 @@ def main() -> None:
     for name in LIVE:
         write_live(name, docs / "live", is_empty=arguments.without_live)
     for path in docs.rglob("*.md"):
-        text = page(path, path.read_text(encoding="utf-8"))
+        text = page(path.relative_to(docs), path.read_text(encoding="utf-8"))
         header = f"---\n{json.dumps(settings(path))}\n---\n"  # JSON is YAML
         path.write_text(header + text, encoding="utf-8")
     theme = (SITE / "theme.yml").read_text(encoding="utf-8")
@@ -92,7 +93,7 @@ def navigation() -> list[dict]:
 
 
 def page(path: Path, text: str) -> str:
-    """A page of the documentation as Markdown that needs no further extension."""
+    """A page of the documentation, by its path in the folder, as Markdown with HTML."""
     code: list[str] = []
 
     def store(found: re.Match) -> str:
@@ -108,8 +109,8 @@ def page(path: Path, text: str) -> str:
     def link(found: re.Match) -> str:
         """A link to a file that is not part of the documentation becomes text."""
         label, target = found.groups()
-        is_page = target.startswith(("http:", "https:")) or (path.parent / target).exists()
-        return found[0] if is_page else label
+        is_outside = normpath(path.parent / target).startswith("..")
+        return label if is_outside else found[0]
 
     if path.name in WITH_KEYS:
         text = with_key_anchors(text)

@@ -48,10 +48,9 @@ def test_equations_are_converted_outside_code(page):
     )
 
 
-def test_links_out_of_the_documentation_become_text(page, tmp_path):
-    (tmp_path / "b.md").touch()
-    text = "[`b`](b.md#c), [c](../c.py), [d](https://d.org), [e](#e), `[f](f.md)`"
-    assert page(tmp_path / "a.md", text) == text.replace("[c](../c.py)", "c")
+def test_links_out_of_the_documentation_become_text(page):
+    text = "[`b`](../b.md#c), [c](../../c.py), [d](https://d.org), [e](#e), `[f](../../f.md)`"
+    assert page(Path("guides/a.md"), text) == text.replace("[c](../../c.py)", "c")
 
 
 def test_comments_are_omitted_and_options_stay_on_one_line(page):
