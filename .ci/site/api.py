@@ -142,17 +142,24 @@ def _docstring(doc: str) -> list[str]:
     for title, body in zip(sections[::2], sections[1::2], strict=True):
         if title == "Examples":
             parts += ["**Examples**", f"```python\n{textwrap.dedent(body).strip()}\n```"]
-        else:
-            rows = [_row(entry) for entry in ENTRY.split(body) if entry.strip()]
-            parts.append("\n".join([f"| {title} | |", "|---|---|", *rows]))
+            continue
+        rows = [_row(entry) for entry in ENTRY.split(body) if entry.strip()]
+        if title in ("Returns", "Raises"):
+            lines = [f"*{title}* {names}: {text}" for names, _, text in rows]
+            parts.append("  \n".join(line.removesuffix(": ") for line in lines))
+            continue
+        has_types = any(kind for _, kind, _ in rows)
+        table = [(title, " ", " "), ("---",) * 3, *rows]
+        lines = [" | ".join(row if has_types else (row[0], row[2])) for row in table]
+        parts.append("\n".join(f"| {line} |" for line in lines))
     return [part for part in parts if part.strip()]
 
 
-def _row(entry: str) -> str:
-    """A row of a table, of names and their description."""
-    names, _, description = entry.strip().partition("\n")
-    cells = [f"`{names.replace('`', '')}`", _text(" ".join(description.split()))]
-    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+def _row(entry: str) -> tuple[str, str, str]:
+    """Cells of a table: names, type, description."""
+    head, _, description = entry.strip().partition("\n")
+    names, _, kind = head.replace("`", "").partition(" : ")
+    return f"`{names}`", _text(kind), _text(" ".join(description.split()))
 
 
 def _text(text: str) -> str:

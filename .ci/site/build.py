@@ -61,7 +61,9 @@ def main() -> None:
     parser.add_argument("--without-live", action="store_true", help="leave live pages empty")
     arguments = parser.parse_args()
     docs = arguments.folder / "docs"
-    shutil.copytree(DOCS, docs, dirs_exist_ok=True)
+    if docs.exists():
+        parser.error(f"{docs} exists")
+    shutil.copytree(DOCS, docs)
     for name in ("site.css", "math.woff2", "math.OFL.txt"):
         shutil.copy(SITE / name, docs)
     front = (SITE / "front.txt").read_text(encoding="utf-8")
@@ -116,8 +118,7 @@ def page(path: Path, text: str) -> str:
         text = with_key_anchors(text)
     text = CODE_OR_COMMENT.sub(store, text)
     text = LINK.sub(link, EQUATION.sub(equation, text))
-    text = re.sub("\0(\\d+)\0", lambda found: code[int(found[1])], text)
-    return text
+    return re.sub("\0(\\d+)\0", lambda found: code[int(found[1])], text)
 
 
 def settings(path: Path) -> dict:
