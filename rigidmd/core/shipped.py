@@ -45,7 +45,7 @@ GUIDES = {
         "pictures",
     ),
     "Many runs": ("studies",),
-    "Other programs": ("coming_from", "ase", "calculators", "engines"),
+    "Other programs": ("coming_from", "ase", "engines"),
     "Extend": ("extending",),
 }
 #: Folders of the documentation and their chapters, in the order of the list.

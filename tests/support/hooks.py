@@ -150,8 +150,8 @@ TIERS = {
             f"what_a_document_describes_can_be_done[{page}]"
             for page in (
                 "analysis",
+                "ase",
                 "body_pairs",
-                "calculators",
                 "chemical_potential",
                 "crystals",
                 "engines",

@@ -369,7 +369,7 @@ class CalculatorForce(Force):
     The calculator is called once for each new set of positions, with one `ase.Atoms` of all sites
     with mass, molecules whole, in the order of `system.sites`. Forces within molecules have no
     effect. Its stress gives the molecular virial W = -V sigma - sum_i f_i (x) (r_i - R). The page
-    `calculators` (`rigidmd help calculators`) has the derivation.
+    `ase` (`rigidmd help ase`) has the formulas.
 
     Parameters
     ----------
