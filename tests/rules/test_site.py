@@ -9,7 +9,7 @@ from xml.etree.ElementTree import fromstring, tostring
 import pytest
 from support.common import ROOT
 
-from rigidmd.core.shipped import CHAPTERS
+from rigidmd.core.shipped import CHAPTERS, DOCS
 
 
 @pytest.fixture
@@ -38,6 +38,15 @@ def test_the_navigation_has_all_pages_but_the_list_of_them(site):
     text = str(site("build").navigation())
     pages = set(re.findall(r"(\w+)\.md", text))
     assert pages == {*CHAPTERS, "index", "api"} - {"contents"}
+
+
+def test_the_front_page_and_the_search_name_pages_of_the_documentation(site):
+    front = (ROOT / ".ci" / "site" / "front.txt").read_text(encoding="utf-8")
+    linked = set(re.findall(r"\]\(([\w/]+)\.md\)", front)) - {"reference/api"}
+    assert linked <= {
+        path.relative_to(DOCS).with_suffix("").as_posix() for path in CHAPTERS.values()
+    }
+    assert set(site("build").SYNONYMS) <= set(CHAPTERS)
 
 
 def test_equations_are_converted_outside_code(page):
