@@ -53,8 +53,8 @@ SECTIONS = {
     "start": ("five_minutes", "installation", "why", "contents"),
     "tutorials": ("top", "water", "molecule", "notebook"),
     "guides": tuple(name for names in GUIDES.values() for name in names),
-    "theory": ("dynamics", "bodies", "interactions", "sampling", "errors", "glossary"),
-    "reference": ("commands", "scene", "body", "models", "integrators", "files", "python"),
+    "theory": ("dynamics", "bodies", "interactions", "sampling", "errors", "zero_step"),
+    "reference": ("commands", "scene", "body", "models", "integrators", "files", "python", "units"),
     "evidence": (
         "benchmarks",
         "accuracy_cost",

@@ -230,17 +230,18 @@ def draw(cases: dict, path: Path) -> None:
 
 
 def table(cases: dict) -> str:
-    """Slopes and changes over the whole run, in Markdown."""
+    """Slopes and changes over the whole run, and the plateau of the orthogonality, in Markdown."""
     lines = [
-        "| run | steps | L: slope | in all | energy: slope | in all | QᵀQ: slope | in all |",
-        "|" + "---|" * 8,
+        "| run | steps | L: slope | in all | energy: slope | in all | QQᵀ: plateau |",
+        "|" + "---|" * 7,
     ]
     for name in (case for case in CASES if case in cases):
         found = cases[name]
         cells = [
             f"{fitted_slope(found['changes'].get(q, [])):.2f} | {found['whole'][q]:.1e}"
-            for q in QUANTITIES
+            for q in ("L", "energy")
         ]
+        cells.append(f"{found['changes'].get('QTQ', [[1, 0.0]])[-1][1]:.1e}")
         lines.append(f"| {CASES[name][0]} | {found['steps']:.0e} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
