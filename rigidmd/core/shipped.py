@@ -26,16 +26,8 @@ _SHIPPED = re.compile(r"systems/(?:scripts/|notebooks/)?(\w+)(\.toml|\.ipynb|\.p
 KINDS = {".toml": "scene", ".ipynb": "notebook", ".py": "script"}
 #: Guides by what they are for.
 GUIDES = {
-    "Set up": (
-        "structures",
-        "mixtures",
-        "crystals",
-        "electrostatics",
-        "tables",
-        "body_pairs",
-        "ensembles",
-    ),
-    "Run": ("npt", "slab", "time_step", "fast", "resume", "troubleshooting"),
+    "Set up": ("structures", "electrostatics", "tables", "body_pairs", "ensembles"),
+    "Run": ("npt", "slab", "time_step", "run_times", "resume", "troubleshooting"),
     "Analyse": (
         "analysis",
         "transport",
@@ -50,8 +42,8 @@ GUIDES = {
 }
 #: Folders of the documentation and their chapters, in the order of the list.
 SECTIONS = {
-    "start": ("five_minutes", "installation", "why", "contents"),
-    "tutorials": ("top", "water", "molecule", "notebook"),
+    "start": ("installation", "five_minutes", "why", "contents"),
+    "tutorials": ("water", "top", "molecule", "notebook"),
     "guides": tuple(name for names in GUIDES.values() for name in names),
     "theory": ("dynamics", "bodies", "interactions", "sampling", "errors", "zero_step"),
     "reference": ("commands", "scene", "body", "models", "integrators", "files", "python", "units"),

@@ -213,7 +213,7 @@ def test_a_command_line_that_is_not_known_suggests_what_is(words, expected, caps
 @pytest.mark.parametrize(
     ("word", "expected"),
     [
-        ("restarts", "there are five_minutes, installation, why"),
+        ("restarts", "there are installation, five_minutes, why"),
         ("rdf", "the word is in five_minutes ("),
         ("anlysis", "did you mean analysis?"),
     ],

@@ -606,7 +606,7 @@ def test_help_lists_and_prints_the_chapters(capsys):
     ("name", "expected"),
     [
         ("commandes", "did you mean commands?"),
-        ("qqq", "there are five_minutes, installation, why, contents, top, water"),
+        ("qqq", "there are installation, five_minutes, why, contents, water, top"),
     ],
 )
 def test_a_chapter_that_is_not_there(name, expected, capsys):
