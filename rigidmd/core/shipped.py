@@ -46,7 +46,17 @@ SECTIONS = {
     "tutorials": ("water", "top", "molecule", "notebook"),
     "guides": tuple(name for names in GUIDES.values() for name in names),
     "theory": ("dynamics", "bodies", "interactions", "sampling", "errors", "zero_step"),
-    "reference": ("commands", "scene", "body", "models", "integrators", "files", "python", "units"),
+    "reference": (
+        "commands",
+        "scene",
+        "body",
+        "models",
+        "integrators",
+        "files",
+        "python",
+        "units",
+        "limits",
+    ),
     "evidence": (
         "benchmarks",
         "accuracy_cost",
