@@ -20,8 +20,13 @@ ActionClass = type[argparse.Action]
 Result = TypeVar("Result")
 
 
+#: Of commands, in the order of `rigidmd --help`. It does not list the others.
+GROUPS = ("Start", "Run", "Look", "Study")
+
+
 class Command(NamedTuple):
-    position: int  # in the list of `rigidmd --help`
+    group: str
+    position: int  # in its group
     about: str
     example: str
     arguments: tuple[Argument, ...]
@@ -33,18 +38,19 @@ COMMANDS: dict[str, Command] = {}  # the commands of the imported modules, by na
 
 
 def command(
-    position: int, about: str, example: str, *arguments: Argument, **options: object
+    group: str, position: int, about: str, example: str, *arguments: Argument, **options: object
 ) -> Callable:
     """Register a function as the command of its name, without underscores around it.
 
-    position : in the list of `rigidmd --help`; options : those that no argument sets, such as
-    `writes=True` of a command whose results are files, not what it prints
+    group, position : in `rigidmd --help`, which lists the commands of `GROUPS` with the first
+    sentence of `about`; options : those that no argument sets, such as `writes=True` of a command
+    whose results are files, not what it prints
     The function is called with the options, and returns the exit code.
     """
 
     def register(call: Callable[[Options], int]) -> Callable[[Options], int]:
         COMMANDS[call.__name__.strip("_")] = Command(
-            position, about, example, arguments, options, call
+            group, position, about, example, arguments, options, call
         )
         return call
 

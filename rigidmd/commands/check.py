@@ -12,7 +12,8 @@ if TYPE_CHECKING:
 
 
 @command(
-    70,
+    "Run",
+    10,
     "describe a run without running it",
     "rigidmd check water_nitrogen.toml",
     *SCENE,

@@ -15,23 +15,23 @@ import warnings
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
+from textwrap import fill
+from typing import NoReturn
 
 import rigidmd.commands as package
 from rigidmd.commands import BAD_INPUT, FAILED, INTERRUPTED
-from rigidmd.commands.arguments import COMMANDS
+from rigidmd.commands.arguments import COMMANDS, GROUPS
 from rigidmd.commands.streams import checked_streams, open_streams, warn
 from rigidmd.core.plain_text import did_you_mean
 from rigidmd.errors import RigidMDError, RigidMDWarning, SimulationError, Wording, worded_by
 from rigidmd.features import FEATURES, modules
 
 EXAMPLES = """examples:
-  rigidmd new water                         copy a scene to start from: water.toml
-  rigidmd check water.toml                  describe the run without running it
-  rigidmd run water.toml                    run it. Results go to runs/water
+  rigidmd new water && rigidmd run water.toml               a liquid of water
+  rigidmd new heavy_top_3 && rigidmd run heavy_top_3.toml   one body: a top
   rigidmd run water.toml --set stages.production.timestep_fs=4 -o runs/water4
-  rigidmd energy water.toml --unit kcal/mol
-  rigidmd new heavy_top_3 && rigidmd run heavy_top_3.toml    one body: a top, with figures
-  rigidmd help                              the chapters of the documentation
+
+`rigidmd COMMAND --help` describes a command and its options.
 """
 
 
@@ -77,7 +77,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     try:
         open_streams()
-        options = _parse(sys.argv[1:] if arguments is None else arguments)
+        options = _parse((sys.argv[1:] if arguments is None else arguments) or ["--help"])
         check_address_space()
         streams = checked_streams(lasting=options.writes)
         with warnings.catch_warnings(), without_local_settings(), streams, worded_by(CommandLine()):
@@ -143,8 +143,7 @@ def _parse(words: list[str]) -> argparse.Namespace:
         for row in FEATURES:
             if name in row.commands:
                 raise row.missing(f"rigidmd {name}")
-        suggestion = did_you_mean(name, commands) or ". `rigidmd --help` lists them"
-        parser.error(f"unknown command {name!r}{suggestion}")
+        parser.error(f"unknown command {name!r}{did_you_mean(name, commands)}")
     options, unknown = parser.parse_known_args(words)
     if unknown and name is not None:
         known = dict.fromkeys(re.findall(r"(?<![\w-])--[a-z-]+", commands[name].format_help()))
@@ -161,21 +160,26 @@ def _parser(first: str = "") -> tuple[argparse.ArgumentParser, dict[str, argpars
         " file."
     )
     form = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(
-        "rigidmd", description=about, epilog=EXAMPLES, formatter_class=form
+    parser = _Parser(
+        "rigidmd",
+        usage="rigidmd [-h] [--version] COMMAND ...",
+        description=fill(about, 80),
+        formatter_class=form,
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
-    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    commands = parser.add_subparsers(
+        prog="rigidmd", required=True, metavar="COMMAND", help=argparse.SUPPRESS
+    )
     names = {m.name: f"{package.__name__}.{m.name}" for m in iter_modules(package.__path__)}
     names |= modules("commands")
     for name in [names[first]] if first in names else names.values():
         import_module(name)
-    for name, command in sorted(COMMANDS.items(), key=lambda item: item[1].position):
+    parser.epilog = f"{_listed()}\n{EXAMPLES}"
+    for name, command in COMMANDS.items():
         description = command.about[0].upper() + command.about[1:] + "."
         epilog = f"example:\n  {command.example}"
         texts = {
-            "help": command.about,
-            "description": description,
+            "description": fill(description, 80),
             "epilog": epilog,
             "formatter_class": form,
         }
@@ -184,6 +188,30 @@ def _parser(first: str = "") -> tuple[argparse.ArgumentParser, dict[str, argpars
         for add in command.arguments:
             add(of_command)
     return parser, commands.choices
+
+
+class _Parser(argparse.ArgumentParser):
+    """One whose errors begin with the message, before an example."""
+
+    def error(self, message: str) -> NoReturn:
+        lines = [f"{self.prog}: error: {message}"]
+        if self.prog != "rigidmd":
+            lines.append(f"  for example: {str(self.epilog).splitlines()[1].strip()}")
+        what = "commands" if self.prog == "rigidmd" else "arguments"
+        lines.append(f"`{self.prog} --help` lists the {what}")
+        self.exit(BAD_INPUT, "\n".join(lines) + "\n")
+
+
+def _listed() -> str:
+    """The commands of each group, a line each."""
+    lines = []
+    for group in GROUPS:
+        names = [name for name in COMMANDS if COMMANDS[name].group == group]
+        lines += [f"{group}:"] * bool(names)
+        for name in sorted(names, key=lambda name: COMMANDS[name].position):
+            lines.append(f"  {name:<11}{COMMANDS[name].about.split('. ')[0]}")
+        lines += [""] * bool(names)
+    return "\n".join(lines)
 
 
 class _Version(argparse.Action):

@@ -9,9 +9,10 @@ FIRST_SCENE = "water"
 
 
 @command(
-    75,
-    "compile what a scene needs without running it, such as before a course or on the login node of"
-    " a cluster",
+    "Run",
+    50,
+    "compile what a scene needs without running it. Use it before a course or on the login "
+    "node of a cluster",
     "rigidmd compile water.toml",
     argument(
         "scene",

@@ -6,8 +6,9 @@ from rigidmd.commands.arguments import SCENE, Options, argument, command, flag, 
 
 
 @command(
-    60,
-    "energies and forces of the start",
+    "Study",
+    20,
+    "print energies and forces at the start",
     "rigidmd energy water_dimer.toml --json",
     *SCENE,
     argument(

@@ -4,7 +4,9 @@ from rigidmd.commands.arguments import Options, command
 from rigidmd.features import FEATURES
 
 
-@command(10, "list the scenes, notebooks and scripts that rigidmd ships", "rigidmd examples")
+@command(
+    "Start", 20, "list the scenes, notebooks and scripts that rigidmd ships", "rigidmd examples"
+)
 def _examples(options: Options) -> int:
     from rigidmd.core.shipped import NOTEBOOKS, SCRIPTS, examples
 

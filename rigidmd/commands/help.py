@@ -4,8 +4,9 @@ from rigidmd.commands.arguments import Options, argument, command
 
 
 @command(
-    190,
-    "list the chapters of the documentation, or print one",
+    "Start",
+    40,
+    "list the pages of the documentation, print one, or find a word",
     "rigidmd help water",
     argument(
         "chapter",

@@ -9,8 +9,9 @@ from rigidmd.errors import MoleculeError
 
 
 @command(
-    170,
-    "list the molecular models that rigidmd ships, show or draw one, or write a custom model",
+    "Start",
+    30,
+    "list, show or draw molecular models, or write a custom one",
     "rigidmd models tip4p2005 --draw -o water.svg\n  rigidmd models --from dye.xyz --parameters"
     " table.toml -o dye.toml",
     argument(

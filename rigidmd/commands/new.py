@@ -7,7 +7,8 @@ from rigidmd.commands.arguments import Options, argument, command, flag
 
 
 @command(
-    20,
+    "Start",
+    10,
     "copy a shipped scene, notebook or script to start from",
     "rigidmd new water -o mine.toml",
     argument("name", metavar="NAME", help="which one. `rigidmd examples` lists them"),

@@ -7,7 +7,8 @@ from rigidmd.commands.run import DURATION, run
 
 
 @command(
-    40,
+    "Run",
+    30,
     "continue a run that was stopped",
     "rigidmd resume runs/water --until 200ps",
     argument("folder", metavar="DIR", help="folder of the run"),

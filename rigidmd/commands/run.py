@@ -46,7 +46,8 @@ DURATION = (
 
 
 @command(
-    30,
+    "Run",
+    20,
     "run a scene",
     "rigidmd run water.toml -o runs/water",
     *SCENE,

@@ -5,7 +5,9 @@ import json
 from rigidmd.commands.arguments import Options, command
 
 
-@command(180, "print the JSON schema of scenes, for editors", "rigidmd schema > scene.schema.json")
+@command(
+    "", 10, "print the JSON schema of scenes, for editors", "rigidmd schema > scene.schema.json"
+)
 def _schema(options: Options) -> int:
     from rigidmd.scene import schema
 

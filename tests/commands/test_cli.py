@@ -1,6 +1,7 @@
 """The commands."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -20,7 +21,7 @@ from rigidmd.scene import Scene
 def test_the_commands(printed, tmp_path):
     water = str(ROOT / "systems" / "water.toml")
     assert "1293 = 645 translation + 648 rotation" in printed("check", water).out
-    out = printed("check", ROOT / "systems" / "argon.toml").out
+    out = printed("check", ROOT / "systems" / "argon.toml", "--verbose").out
     assert "charges: no site has one" in out
     assert "rotation and torques: every molecule is a point" in out
     assert "2.351" in printed("models").out  # the dipole of SPC/E
@@ -62,11 +63,31 @@ def test_help_is_quick_and_imports_nothing_heavy():
     assert "example" in done.stdout
 
 
+def test_help_has_four_groups_with_a_line_for_each_command(capsys):
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    text = capsys.readouterr().out
+    assert max(len(line) for line in text.splitlines()) <= 80
+    listed = [line.split()[0] for line in text.splitlines() if re.match(r"  [a-z]+  ", line)]
+    assert listed[0] == "new"
+    assert set(COMMANDS) - set(listed) == {"schema"}  # which works without being listed
+    assert re.findall(r"(?m)^([A-Z]\w+):$", text) == ["Start", "Run", "Look", "Study"]
+
+
+def test_a_wrong_command_line_gives_the_message_first_and_an_example(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["virial", "spce"])
+    assert ended.value.code == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0].endswith("the following arguments are required: --temperatures")
+    assert lines[1].startswith("  for example: rigidmd virial spce")
+
+
 def test_adding_a_command_takes_one_file(tmp_path, monkeypatch, capsys, printed):
     (tmp_path / "greet.py").write_text(
         "from rigidmd.commands.arguments import command\n\n"
         "def arguments(parser):\n    parser.add_argument('name', metavar='NAME', help='whom to greet')\n\n"
-        "@command(5, 'greet someone', 'rigidmd greet Ada', arguments)\n"
+        "@command('Start', 5, 'greet someone. Kindly', 'rigidmd greet Ada', arguments)\n"
         "def greet(options):\n    print(f'hello {options.name}')\n    return 3\n"
     )
     package = sys.modules["rigidmd.commands"]
@@ -74,9 +95,7 @@ def test_adding_a_command_takes_one_file(tmp_path, monkeypatch, capsys, printed)
     with pytest.raises(SystemExit):
         main(["--help"])
     listed = capsys.readouterr().out
-    assert listed.index("greet someone") < listed.index(
-        "list the scenes"
-    )  # position 5 is before all others
+    assert listed.index("greet someone\n") < listed.index("copy a shipped")  # 5 is the first
     assert printed("greet", "Ada", code=3).out == "hello Ada\n"
     with pytest.raises(SystemExit):
         main(["gret"])
@@ -193,7 +212,7 @@ def test_a_missing_scene(command, path, expected, printed, monkeypatch, tmp_path
     [
         (["analyze", "runs/x"], "unknown command 'analyze'; did you mean analyse?"),
         (["acuracy", "x.toml"], "unknown command 'acuracy'; did you mean accuracy?"),
-        (["foo"], "unknown command 'foo'. `rigidmd --help` lists them"),
+        (["foo"], "unknown command 'foo'\n`rigidmd --help` lists the commands"),
         (
             ["run", "x.toml", "--forse"],
             "rigidmd run: error: unknown argument '--forse'; did you mean --force?",

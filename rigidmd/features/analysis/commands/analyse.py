@@ -27,9 +27,10 @@ class _List(argparse.Action):
 
 
 @command(
-    120,
-    "measure g(r), diffusion, orientation, dielectric constant, viscosity and more in a run, each"
-    " with its error",
+    "Look",
+    40,
+    "measure g(r), diffusion, viscosity and more in a run, with errors. Orientation and the "
+    "dielectric constant are among them",
     "rigidmd analyse runs/water --only rdf,diffusion --from 10ps",
     argument(
         "folder",

@@ -8,7 +8,8 @@ from rigidmd.core.programs import programs
 
 
 @command(
-    80,
+    "Study",
+    60,
     "write a scene as a folder that runs on another engine by itself",
     "rigidmd export water_pme.toml --to lammps -o water_lammps",
     *SCENE,

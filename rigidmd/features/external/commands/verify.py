@@ -19,9 +19,10 @@ def _engine(parser: argparse.ArgumentParser) -> None:
 
 
 @command(
-    90,
-    "compute a scene on two engines and compare energies by term, forces, virial, and a short run."
-    " Exit code 0 if they agree, else 1",
+    "Study",
+    50,
+    "compare energies and forces of a scene on two engines. Energies are compared by term, "
+    "also the virial and a short run. Exit code 0 if they agree, else 1",
     "rigidmd verify water_pme.toml --engine lammps --ranks 2",
     *SCENE,
     _engine,

@@ -19,8 +19,10 @@ def _temperatures(text: str) -> list[float]:
 
 
 @command(
-    67,
-    "second virial coefficients of molecular models, with cross coefficients and errors",
+    "Study",
+    40,
+    "compute second virial coefficients of models, with errors. Several models give cross "
+    "coefficients too",
     "rigidmd virial spce nitrogen_trappe --temperatures 300,400,500",
     argument(
         "models",

@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 
 
 @command(
-    100,
-    "measure the error and the run time of integrators at several time steps",
+    "Study",
+    10,
+    "measure the error and the run time of integrators and time steps",
     "rigidmd accuracy heavy_top_3.toml --integrators velocity_verlet,srkn_6\n"
     "  rigidmd accuracy heavy_top_3.toml --integrators rk4,rk4_quaternion,rk4_euler_angles\n"
     "  rigidmd accuracy liquid.toml --averages --sample-ps 50 --timesteps 1,2,4,6,8 "

@@ -8,9 +8,10 @@ from rigidmd.commands.arguments import Options, argument, command, flag
 
 
 @command(
+    "Look",
     50,
-    "report where two runs diverge and how their inputs and versions differ. Exit code 0 if they"
-    " are the same to the last bit, else 1",
+    "report where two runs diverge. It also prints how their inputs and versions differ. "
+    "Exit code 0 if they are the same to the last bit, else 1",
     "rigidmd compare runs/water runs/water2",
     argument("first", metavar="RUN", help="folder of a run"),
     argument("second", metavar="RUN", help="folder of another run"),

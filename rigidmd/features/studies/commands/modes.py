@@ -26,9 +26,10 @@ ROWS = 8
 
 
 @command(
-    65,
-    "normal modes of rigid molecules at a minimum of the energy: frequencies, infrared intensities,"
-    " zero-point and free energy, the longest stable step",
+    "Study",
+    30,
+    "compute normal modes of rigid molecules. At a minimum of the energy: frequencies, "
+    "infrared intensities, zero-point and free energy, the longest stable step",
     "rigidmd modes water_dimer.toml --animate 10 && rigidmd view runs/water_dimer-modes",
     *SCENE,
     flag("--no-minimise", help="require that the start is a minimum"),

@@ -7,9 +7,10 @@ from rigidmd.commands.arguments import Options, command, flag, output_folder, re
 
 
 @command(
-    110,
-    "run the built-in stress tests, each compared with a known answer. Exit code 1 if an"
-    " error is undetected",
+    "Study",
+    70,
+    "run the built-in stress tests, each compared with a known answer. Exit code 1 if an "
+    "error is undetected",
     "rigidmd stability --quick --case near_linear --case water_steps",
     flag("--quick", help="use fewer settings, integrators and steps, which takes minutes"),
     repeated("--case", "NAME", help="only this case, may be repeated"),

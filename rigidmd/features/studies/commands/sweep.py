@@ -29,8 +29,10 @@ COUNT = number(int, 1, 4096, "a number from 1 to 4096")
 
 
 @command(
-    130,
-    "run a scene at many points, a folder each, with a table and a figure of means and errors",
+    "Run",
+    40,
+    "run a scene at many points, with a table and a figure of means. Each run has a folder, "
+    "each mean an error",
     "rigidmd sweep water.toml --set stages.equilibration.temperature_K=280,290,300 --set seed=1..8"
     " --jobs 2\n  rigidmd sweep water.toml --replicas 8\n  rigidmd sweep water.toml --set"
     " stages.2.timestep_fs=1,2,4 --extrapolate stages.2.timestep_fs --replicas 8\n  rigidmd sweep"

@@ -15,7 +15,8 @@ from rigidmd.commands.streams import progress_bar
 
 
 @command(
-    150,
+    "Look",
+    30,
     "write an animation of a run as a file",
     "rigidmd film runs/water -o water.mp4 --plots",
     *run_folder(

@@ -6,8 +6,10 @@ from rigidmd.commands.arguments import Options, command, file_about_run, print_p
 
 
 @command(
-    138,
-    "write one page about a run: means with errors, plots, margins, files, how to repeat it",
+    "Look",
+    20,
+    "write a page about a run: means with errors, plots, files. It also has margins and how "
+    "to repeat the run",
     "rigidmd report runs/water",
     *run_folder("page (default: report.html in the folder of the run)"),
     scene="this run",

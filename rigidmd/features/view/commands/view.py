@@ -6,8 +6,9 @@ from rigidmd.commands.arguments import Options, command, file_about_run, print_p
 
 
 @command(
-    140,
-    "write one page with the animation of a run, which opens in any browser without a network",
+    "Look",
+    10,
+    "write a page with the animation of a run. It opens in any browser without a network",
     "rigidmd view runs/water -o water.html",
     *run_folder("page (default: view.html in the folder of the run)"),
     scene="this run",
