@@ -123,14 +123,19 @@ def _default_step(scene: MolecularScene, stage: Stage, fastest: FastMotion | Non
     longest = min(longest, LONGEST_DEFAULT, stage.duration / FEMTOSECOND)
     if longest == 0:
         return USUAL_STEP
-    decade = floor(log10(longest))
-    steps = [float(f"{digit}e{k}") for k in (decade, decade - 1) for digit in DIGITS]
-    allowed = [step for step in steps if longest / 2 <= step <= longest]
+    allowed = round_steps(longest)
     output = scene.output
     intervals = [stage.duration, output.log_interval_ps]
     if output.trajectory:
         intervals.append(output.trajectory_interval_ps)
     return next((step for step in allowed if _divides(step, intervals)), allowed[0])
+
+
+def round_steps(longest: float) -> list[float]:
+    """Round time steps between half of the longest one and this, fs."""
+    decade = floor(log10(longest))
+    steps = [float(f"{digit}e{k}") for k in (decade, decade - 1) for digit in DIGITS]
+    return [step for step in steps if longest / 2 <= step <= longest]
 
 
 def _divides(step: float, intervals: list[float]) -> bool:
@@ -206,9 +211,8 @@ def _given_steps(scene: MolecularScene) -> Iterator[tuple[int, Stage, float]]:
 
 
 def step_warnings(scene: MolecularScene) -> list[str]:
-    """Warnings of time steps that are unstable, inaccurate or needlessly short for these molecules
-    in a liquid, and of orders that truncated forces do not allow. A step is unstable if a molecule
-    at its thermal speed moves or rotates in it by more than `stable_angle` amplitudes."""
+    """Warnings of time steps that are inaccurate or needlessly short for these molecules in a
+    liquid, and of orders that truncated forces do not allow. See `step_errors`."""
     warnings = []
     forces = scene.forces
     ends = forces.cutoff_A is not None or scene.box.periodic
@@ -237,26 +241,38 @@ def sentences_on_steps(
             yield f"stages.{k}: timestep_fs = {stage.step_fs:g} {sentence}"
 
 
-def _step_warning(stage: Stage, fastest: FastMotion, temperature: float) -> str:
-    """What is wrong with the step of a stage for a motion at a temperature, K. Empty if nothing
-    is."""
+def step_errors(scene: MolecularScene) -> list[str]:
+    """Errors of time steps that are unstable for these molecules in a liquid: in which a molecule
+    at its thermal speed moves or rotates by more than `stable_angle` amplitudes."""
+    return list(sentences_on_steps(scene, _instability))
+
+
+def _instability(stage: Stage, fastest: FastMotion, temperature: float) -> str:
+    """How the step of a stage is unstable for a motion at a temperature, K. Empty if it is not."""
     time, size, unit, name, does = fastest
     longest = fastest.longest_step(stage)
-    dt = stage.step
-    limit = f"{longest / FEMTOSECOND:.3g} fs"
-    if dt > longest:
-        return (
-            f"is too long for {name} at {temperature:g} K: in a step it {does} by"
-            f" {dt / time * size:.2g} {unit} (rms); {stage.integrator} is stable up to {limit}"
-            f" where, as in liquids, the stiffest motions swing by {size:g} {unit}"
-        )
+    if stage.step <= longest:
+        return ""
+    limit = longest / FEMTOSECOND
+    return (
+        f"is unstable for {name} at {temperature:g} K: in a step it {does} by"
+        f" {stage.step / time * size:.2g} {unit} (rms). In a liquid {stage.integrator} is stable up"
+        f" to {limit:.3g} fs. Use {round_steps(limit)[0]:g} fs or less"
+    )
+
+
+def _step_warning(stage: Stage, fastest: FastMotion, temperature: float) -> str:
+    """What is wrong with a stable step of a stage for a motion at a temperature, K. Empty if
+    nothing is."""
+    longest = fastest.longest_step(stage)
     if sentence := accuracy_warning(stage, fastest, temperature):
         return sentence
-    if longest < inf and dt * NEEDLESS < longest:
-        cause = "is it in ps?" if dt * 1000 * NEEDLESS >= longest else "is it in another unit?"
+    if longest < inf and stage.step * NEEDLESS < longest:
+        in_ps = stage.step * 1000 * NEEDLESS >= longest
         return (
-            f"is {longest / dt:.0f} times shorter than {stage.integrator} needs for {name},"
-            f" {limit}: {cause}"
+            f"is {longest / stage.step:.0f} times shorter than {stage.integrator} needs for"
+            f" {fastest.molecule}, {longest / FEMTOSECOND:.3g} fs:"
+            f" {'is it in ps?' if in_ps else 'is it in another unit?'}"
         )
     return ""
 

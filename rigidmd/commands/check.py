@@ -1,7 +1,9 @@
 """`rigidmd check`."""
 
+import sys
 from typing import TYPE_CHECKING, cast
 
+from rigidmd.commands import FAILED
 from rigidmd.commands.arguments import SCENE, Options, add_engine, command, flag, read_scene
 from rigidmd.commands.streams import warn
 from rigidmd.errors import SceneError
@@ -14,14 +16,16 @@ if TYPE_CHECKING:
 @command(
     "Run",
     10,
-    "describe a run without running it",
+    "describe a run without running it. Exit code 1 if a time step is unstable",
     "rigidmd check water_nitrogen.toml",
     *SCENE,
     add_engine,
     flag(
-        "--program",
-        help="also print the rows of a step: what is done, in which order, on how many blocks",
+        "-v",
+        "--verbose",
+        help="also print what is compiled in, what is omitted, and the reasons",
     ),
+    flag("--program", help="also print the compiled passes of a time step, in order"),
     flag(
         "--profile",
         help="also measure which fraction of a step each row of the forces takes, from the start",
@@ -37,12 +41,14 @@ def _check(options: Options) -> int:
         if getattr(options, option):
             kind.check_has(scene, f"--{option}")
     system = kind.build(scene)
-    print(kind.describe(system))
+    print(kind.describe(system, verbose=options.verbose))
     if is_molecular(scene):
         _print_more(options, cast("System", system))
     for warning in (*system.warnings, *kind.step_warnings(system)):
         warn(warning)
-    return 0
+    for error in (errors := kind.step_errors(system)):
+        print(f"rigidmd: error: {scene.source}: {error}", file=sys.stderr)
+    return FAILED if errors else 0
 
 
 def _print_more(options: Options, system: "System") -> None:

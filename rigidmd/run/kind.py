@@ -56,12 +56,19 @@ class Kind(ABC, Generic[SceneT, SystemT]):
         """
 
     @abstractmethod
-    def describe(self, system: SystemT) -> str:
-        """How the scene of a system would run. Raises SceneError if it would not."""
+    def describe(self, system: SystemT, *, verbose: bool = False) -> str:
+        """How the scene of a system would run. Raises SceneError if it would not.
+
+        verbose : with what is compiled in and what is omitted, and the reasons
+        """
+
+    @abstractmethod
+    def step_errors(self, system: SystemT) -> list[str]:
+        """Errors of the time steps of a system: those that are unstable."""
 
     @abstractmethod
     def step_warnings(self, system: SystemT) -> list[str]:
-        """Warnings on the time steps of a system."""
+        """Warnings on the other time steps."""
 
     @abstractmethod
     def run_part(self, simulation: "Simulation", scene: SceneT, user_code: Json) -> "RunPart":
@@ -112,10 +119,15 @@ class Molecules(Kind["MolecularScene", "System"]):
 
         return build(scene, user_code)
 
-    def describe(self, system: "System") -> str:
+    def describe(self, system: "System", *, verbose: bool = False) -> str:
         from rigidmd.assemble.describe import describe_system
 
-        return describe_system(system)
+        return describe_system(system, verbose=verbose)
+
+    def step_errors(self, system: "System") -> list[str]:
+        from rigidmd.assemble.time_step import step_errors
+
+        return step_errors(system.scene)
 
     def step_warnings(self, system: "System") -> list[str]:
         from rigidmd.assemble.time_step import step_warnings
@@ -184,7 +196,7 @@ def resolve(scene: AnyScene) -> AnyScene:
     return kind_of(scene).build(scene).scene
 
 
-def describe(scene: Scene, *, user_code: bool = True) -> str:
+def describe(scene: Scene, *, user_code: bool = True, verbose: bool = False) -> str:
     """How a scene would run. Raises the errors of `Kind.build`."""
     kind = kind_of(scene)
-    return kind.describe(kind.build(scene, user_code=user_code))
+    return kind.describe(kind.build(scene, user_code=user_code), verbose=verbose)

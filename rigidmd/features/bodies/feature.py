@@ -41,10 +41,15 @@ class BodyKind(Kind[BodyScene, "BodySystem"]):
 
         return build_body(scene)
 
-    def describe(self, system: "BodySystem") -> str:
+    def describe(self, system: "BodySystem", *, verbose: bool = False) -> str:
         from rigidmd.features.bodies.describe import describe_body
 
-        return describe_body(system)
+        return describe_body(system, verbose=verbose)
+
+    def step_errors(self, system: "BodySystem") -> list[str]:
+        from rigidmd.features.bodies.stable_step import step_errors
+
+        return step_errors(system)
 
     def step_warnings(self, system: "BodySystem") -> list[str]:
         from rigidmd.features.bodies.stable_step import step_warnings

@@ -25,7 +25,7 @@ from rigidmd.features.bodies.motion import (
     stacked,
     states_of,
 )
-from rigidmd.features.bodies.stable_step import stable_step, step_warnings
+from rigidmd.features.bodies.stable_step import stable_step, step_errors, step_warnings
 from rigidmd.features.bodies.summary import summarise_body, summary_text
 from rigidmd.features.bodies.system import BodySystem, Pose
 from rigidmd.formats import format_of
@@ -280,7 +280,7 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
                 " order 2. Otherwise integrator = 'dop853'"
             )
         self.record.stable = stable_step(system)
-        for sentence in step_warnings(system):
+        for sentence in (*step_errors(system), *step_warnings(system)):
             self.simulation._note(sentence)
 
     def durations(self) -> list[float]:

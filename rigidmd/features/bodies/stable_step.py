@@ -5,6 +5,7 @@ from math import inf, sqrt
 import numpy as np
 
 from rigidmd.assemble.harmonic import INACCURATE, stable_angle, step_error
+from rigidmd.assemble.time_step import round_steps
 from rigidmd.core.integrators import Scheme
 from rigidmd.features.bodies.system import BodySystem
 from rigidmd.mechanics.free_rotor import SplitRotor
@@ -17,27 +18,33 @@ def stable_step(system: BodySystem) -> float | None:
     return angle / rate if system.scene.watch.stable_step and rate > 0 and angle < inf else None
 
 
-def step_warnings(system: BodySystem) -> list[str]:
-    """Warnings of a step that is unstable or inaccurate for the motion of a body at its start."""
-    run, method = system.scene.run, system.method
-    longest = stable_step(system)
-    if longest is None:
+def step_errors(system: BodySystem) -> list[str]:
+    """Errors of a step that is unstable for the motion of a body at its start."""
+    run, longest = system.scene.run, stable_step(system)
+    if longest is None or run.timestep_s <= longest:
         return []
-    rate = fastest_rate(system)
-    moves = f"at its start the body swings or spins at {rate:.3g} rad/s"
-    if run.timestep_s > longest:
-        follows = f"which {run.integrator} can follow up to {longest:.3g} s"
-        return [
-            f"timestep_s = {run.timestep_s:g} is longer than what is stable: {moves}, {follows}"
-        ]
-    error = step_error(method, rate * run.timestep_s) if isinstance(method, Scheme) else 0.0
-    if error > INACCURATE:
-        what = f"as if its torques were wrong by {error:.0%}"
-        return [
-            f"timestep_s = {run.timestep_s:g} is inaccurate: {moves}, which {run.integrator}"
-            f" follows {what}"
-        ]
-    return []
+    return [
+        f"timestep_s = {run.timestep_s:g} is unstable: {_moves(system)}, which {run.integrator} can"
+        f" follow up to {longest:.3g} s. Use {round_steps(longest)[0]:g} s or less"
+    ]
+
+
+def step_warnings(system: BodySystem) -> list[str]:
+    """Warnings of a stable step that is inaccurate for the motion of a body at its start."""
+    run, method, longest = system.scene.run, system.method, stable_step(system)
+    if longest is None or run.timestep_s > longest or not isinstance(method, Scheme):
+        return []
+    error = step_error(method, fastest_rate(system) * run.timestep_s)
+    if error <= INACCURATE:
+        return []
+    return [
+        f"timestep_s = {run.timestep_s:g} is inaccurate: {_moves(system)}, which {run.integrator}"
+        f" follows as if its torques were wrong by {error:.0%}"
+    ]
+
+
+def _moves(system: BodySystem) -> str:
+    return f"at its start the body swings or spins at {fastest_rate(system):.3g} rad/s"
 
 
 def fastest_rate(system: BodySystem) -> float:

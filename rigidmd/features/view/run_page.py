@@ -32,7 +32,7 @@ from rigidmd.features.view.page import (
 )
 from rigidmd.formats import BY_EXTENSION
 from rigidmd.io.folder import SCENE
-from rigidmd.run.kind import describe
+from rigidmd.run.kind import kind_of
 from rigidmd.run.record import Record, read_record
 from rigidmd.run.resume import MADE_WITH
 
@@ -63,9 +63,10 @@ def write_report(folder: Path, path: Path) -> tuple[Path, list[str]]:
 
 def parts(record: Record, animation: str = "") -> Iterator[str]:
     """The parts of the page, as HTML. animation : HTML with the plots"""
-    lines = describe(record.scene, user_code=False).splitlines()  # the output of `rigidmd check`
-    known = {line.strip() for line in lines}
-    warnings = [note for note in (record.summary or {}).get("notes", ()) if note not in known]
+    kind = kind_of(record.scene)
+    system = kind.build(record.scene, user_code=False)
+    notes_of_run = (record.summary or {}).get("notes", ())
+    warnings = [note for note in notes_of_run if note not in system.notes]
     yield f'<p class="faint">{html.escape(record.scene.in_short)}</p>'
     yield notes([*record.missing, *warnings])
     yield animation
@@ -76,12 +77,8 @@ def parts(record: Record, animation: str = "") -> Iterator[str]:
         for title, texts in feature.page_parts(record):
             yield section(title, *texts)
     yield section("Stability margins", _margins(record))
-    start = lines.index("omitted:") if "omitted:" in lines else len(lines)
-    end = next(
-        (k for k in range(start + 1, len(lines)) if not lines[k].startswith("  ")), len(lines)
-    )
-    yield section("System and interactions", code("\n".join([*lines[:start], *lines[end:]])))
-    yield section("Not used, and why", items(line.strip() for line in lines[start + 1 : end]))
+    yield section("System and interactions", code(kind.describe(system)))
+    yield section("Not used, and why", items(system.left_out))
     yield section("Files", _files(record))
     yield section("How to repeat it", *_repeat(record))
 

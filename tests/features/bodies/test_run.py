@@ -207,7 +207,7 @@ def test_trajectories_show_the_body(name, tmp_path):
 
 @pytest.mark.parametrize("path", BODIES, ids=lambda path: path.stem)
 def test_check_describes_every_scene(path, printed):
-    said = printed("check", path).out
+    said = printed("check", path, "--verbose").out
     assert "degrees of freedom" in said
     assert "omitted:" in said
     assert "pair forces" in said

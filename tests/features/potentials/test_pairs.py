@@ -117,7 +117,7 @@ for threads in (1, 2):
     ends.append([getattr(results.state, name).tobytes() for name in ("position", "velocity", "rotation")])
 print(json.dumps({
     "energy": tallies["soft_repulsion"].energy, "expected": expected, "force_error": error, "force": abs(force).max(),
-    "same_bits": ends[0] == ends[1], "check": describe(scene), "without": describe(Scene.from_dict(data)),
+    "same_bits": ends[0] == ends[1], "check": describe(scene, verbose=True), "without": describe(Scene.from_dict(data)),
     "column": system.quantities["soft_repulsion"].header, "file": rigidmd.__file__,
     "schema": list(schema()["$defs"]["Forces"]["properties"]["soft_repulsion"]["properties"]),
     "errors": [messages({}), messages({"strength_kJ_mol": 1.0, "range": 3.0})],

@@ -331,8 +331,9 @@ def test_check_states_how_and_what_is_left_out():
     water = {"cutoff_A": 6.0, "electrostatics": "pme", "ewald_accuracy": 1e-4}
     text = describe(small_scene({"spce": 20}, 13.0, forces=water))
     assert "splines of order" in text and "estimated rms error of the force on a site" in text
-    text = describe(small_scene({"spce": 20}, 13.0, forces=water | {"electrostatics": "ewald"}))
+    scene = small_scene({"spce": 20}, 13.0, forces=water | {"electrostatics": "ewald"})
+    text = describe(scene, verbose=True)
     assert "k-vectors, |n| up to" in text and "Fourier transforms: electrostatics is ewald" in text
     assert "Fourier transforms: electrostatics is reaction_field" in describe(
-        small_scene({"spce": 20}, 18.1)
+        small_scene({"spce": 20}, 18.1), verbose=True
     )

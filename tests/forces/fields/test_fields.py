@@ -228,8 +228,13 @@ def test_what_is_frozen_is_left_alone():
     assert tallies["gravity"].energy != 0
 
 
+def report(scene) -> str:
+    """The whole report of `rigidmd check`, without its line breaks."""
+    return " ".join(describe(scene, verbose=True).split())
+
+
 def test_check_describes_fields_and_what_is_left_out():
-    text = describe(slit(OSCILLATING | {"gravity_m_s2": [0.0, 0.0, -9.81]}))
+    text = report(slit(OSCILLATING | {"gravity_m_s2": [0.0, 0.0, -9.81]}))
     assert (
         "electric field: (0.3, -0.2, 0.6) V/nm cos(2 pi f t + 40°), f = 2.5/ps. Its work is in the energy ledger"
         in text
@@ -240,14 +245,14 @@ def test_check_describes_fields_and_what_is_left_out():
         in text
     )
     assert "total momentum: conserved along x and y" in text
-    assert "  restraints: not in [fields]" in text
-    held = describe(
+    assert "restraints: not in [fields]" in text
+    held = report(
         small_scene({"spce": 4}, 20.0, fields={"restraints": [{"stiffness_kJ_mol_A2": 2.0}]})
     )
     assert "restraints 0: 4 molecules restrained to their starting positions, 2 kJ/mol/Å²" in held
     assert "total momentum: conserved nowhere" in held
     assert "electric field, gravity, walls: not in [fields]" in held
-    pme = describe(slit({}, forces={"cutoff_A": 6.9, "electrostatics": "pme"}))
+    pme = report(slit({}, forces={"cutoff_A": 6.9, "electrostatics": "pme"}))
     assert "total momentum: removed along x and y every 1 ps" in pme
     assert "fields.walls: pme includes the periodic images beyond the walls" in pme
 
@@ -504,7 +509,7 @@ energy, total = tallies["trap"].energy, with_trap.force.sum(axis=0)
 print(json.dumps({
     "energy": energy, "expected": 25 * float((state.position**2).sum()),
     "force": total.tolist(), "sum": (-50 * state.position.sum(axis=0)).tolist(),
-    "check": describe(trapped), "without": describe(scene({})), "schema": schema()["$defs"]["Trap"]["description"],
+    "check": describe(trapped), "without": describe(scene({}), verbose=True), "schema": schema()["$defs"]["Trap"]["description"],
     "errors": [messages({"trap": {"stiffness_kJ_mol_A2": -1.0}}), messages({"trap": {"stiffness": 1.0}}),
                messages({"trap": {"stiffness_kJ_mol_A2": 1.0}}, frozen="1")],
 }))
