@@ -2,7 +2,7 @@
 error."""
 
 from functools import cache
-from math import inf, sqrt
+from math import floor, inf, log10, sqrt
 
 import numpy as np
 
@@ -13,6 +13,8 @@ from rigidmd.core.integrators import DRIFT, KICK, RK4, Scheme, Solver
 INACCURATE = 0.1
 #: Below this w dt the error of a step is extrapolated by the order of the scheme.
 SMALL_ANGLE = 0.03
+#: Leading digits of round steps, which divide usual intervals.
+DIGITS = (5.0, 4.0, 2.5, 2.0, 1.0)
 
 
 def _trace(scheme: Scheme, square: np.ndarray) -> np.ndarray:
@@ -50,3 +52,10 @@ def step_error(scheme: Scheme, angle: float) -> float:
         return step_error(scheme, small) * (angle / small) ** scheme.order
     followed = np.arccos(np.clip(_trace(scheme, np.array([angle**2]))[0] / 2, -1, 1))
     return abs(float(followed / angle) ** 2 - 1)
+
+
+def round_steps(longest: float) -> list[float]:
+    """Round time steps between half of the longest one and this, in the same unit."""
+    decade = floor(log10(longest))
+    steps = [float(f"{digit}e{k}") for k in (decade, decade - 1) for digit in DIGITS]
+    return [step for step in steps if longest / 2 <= step <= longest]

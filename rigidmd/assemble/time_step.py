@@ -8,13 +8,13 @@ and temperature.
 
 from collections.abc import Callable, Iterator
 from functools import cache
-from math import floor, inf, log10, sqrt
+from math import inf, sqrt
 from operator import attrgetter
 from typing import Literal, NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.harmonic import INACCURATE, stable_angle, step_error
+from rigidmd.assemble.harmonic import INACCURATE, round_steps, stable_angle, step_error
 from rigidmd.assemble.species import species_of
 from rigidmd.core.integrators import WITH_THERMOSTAT, Scheme
 from rigidmd.errors import SceneError
@@ -45,8 +45,6 @@ DEFAULT_ERROR = 0.0125
 #: most 0.0017 kT per degree of freedom, but the conserved energy of CO2, benzene and acetonitrile
 #: drifts by 0.3 to 1.5 kT/ns per degree of freedom.
 LONGEST_DEFAULT = 10.0
-#: Leading digits of default steps, which divide usual intervals.
-DIGITS = (5.0, 4.0, 2.5, 2.0, 1.0)
 #: A step that is this many times shorter than the longest stable one is probably in another unit.
 NEEDLESS = 1000
 #: precision = "auto" is mixed where the time-step error is at least this many times that of
@@ -129,13 +127,6 @@ def _default_step(scene: MolecularScene, stage: Stage, fastest: FastMotion | Non
     if output.trajectory:
         intervals.append(output.trajectory_interval_ps)
     return next((step for step in allowed if _divides(step, intervals)), allowed[0])
-
-
-def round_steps(longest: float) -> list[float]:
-    """Round time steps between half of the longest one and this, fs."""
-    decade = floor(log10(longest))
-    steps = [float(f"{digit}e{k}") for k in (decade, decade - 1) for digit in DIGITS]
-    return [step for step in steps if longest / 2 <= step <= longest]
 
 
 def _divides(step: float, intervals: list[float]) -> bool:

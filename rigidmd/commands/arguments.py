@@ -20,7 +20,7 @@ ActionClass = type[argparse.Action]
 Result = TypeVar("Result")
 
 
-#: Of commands, in the order of `rigidmd --help`. It does not list the others.
+#: Groups of commands in the order of `rigidmd --help`, which does not list the others.
 GROUPS = ("Start", "Run", "Look", "Study")
 
 

@@ -152,7 +152,7 @@ def _parse(words: list[str]) -> argparse.Namespace:
     return options
 
 
-def _parser(first: str = "") -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
+def _parser(first: str = "") -> tuple[argparse.ArgumentParser, dict[str, "_Parser"]]:
     """The parser of a command line, and those of its commands by name: of all, or of the one that
     is the first word."""
     about = (

@@ -64,7 +64,7 @@ class Kind(ABC, Generic[SceneT, SystemT]):
 
     @abstractmethod
     def step_errors(self, system: SystemT) -> list[str]:
-        """Errors of the time steps of a system: those that are unstable."""
+        """Error messages on the unstable time steps of a system."""
 
     @abstractmethod
     def step_warnings(self, system: SystemT) -> list[str]:

@@ -23,8 +23,9 @@ def describe_body(system: BodySystem, *, verbose: bool = False) -> str:
         ],
     }
     if verbose:
-        in_scheme = isinstance(system.method, Scheme)
-        body = system.engine().model_for(system.method) if in_scheme else system.body
+        method = system.method
+        is_scheme = isinstance(method, Scheme)
+        body = system.engine().model_for(method) if is_scheme else system.body
         words = [class_words(part) for part in body if part]
         compiled = [name for name in words if not name.startswith("no ")]
         parts |= {"compiled in": [", ".join(compiled)], "omitted": system.left_out}

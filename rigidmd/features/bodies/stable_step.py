@@ -4,8 +4,7 @@ from math import inf, sqrt
 
 import numpy as np
 
-from rigidmd.assemble.harmonic import INACCURATE, stable_angle, step_error
-from rigidmd.assemble.time_step import round_steps
+from rigidmd.assemble.harmonic import INACCURATE, round_steps, stable_angle, step_error
 from rigidmd.core.integrators import Scheme
 from rigidmd.features.bodies.system import BodySystem
 from rigidmd.mechanics.free_rotor import SplitRotor
