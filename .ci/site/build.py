@@ -41,7 +41,10 @@ LISTED = "contents"
 WEIGHTS = {"start": 2, "tutorials": 2, "guides": 2, "evidence": 0.5, "project": 0.25}
 #: Other words for what a page is about.
 SYNONYMS = {
+    "chemical_potential": ["chemical potential"],
+    "npt": ["density"],
     "resume": ["continue", "restart"],
+    "run_times": ["how long", "speed"],
     "slab": ["surface tension"],
     "tables": ["own potential", "custom potential", "user-defined potential"],
 }
