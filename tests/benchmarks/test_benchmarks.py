@@ -65,7 +65,7 @@ class Parsed(Exception):
 def commands_in(text: str) -> list[tuple[str, list[str]]]:
     """Scripts of this folder with their arguments, in the order of a text."""
     text = text.replace("\\\n", " ")
-    found = re.findall(r"python (tests/benchmarks/\w+\.py)([^`#\n]*)", text)
+    found = re.findall(r"python (tests/benchmarks/\w+\.py)([^`#|\n]*)", text)
     return [(script, shlex.split(rest.partition("-->")[0])) for script, rest in found]
 
 
