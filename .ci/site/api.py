@@ -132,7 +132,11 @@ def _without_modules(text: str) -> str:
     text = re.sub(r"<(?:function [^>]*(?:>[^>]*)?|factory)>", "...", text)
     text = re.sub(r"\b(?:rigidmd|collections|typing|pathlib|numpy|pandas)\.(?:\w+\.)*|~", "", text)
     text = re.sub(r"\b(Scene|System)T\b", r"\1", text)
-    return re.sub(r"'(?=[\w.]*[A-Z])([^']*)'", r"\1", text)
+    text = re.sub(r"\bAnnotated\[(\w+), [^\]]*\]", r"\1", text)
+    text = re.sub(r"\bOptional\[(\w+|Literal\[[^\]]*\])\]", r"\1 | None", text)
+    text = re.sub(r"_Buffer, .*?_NestedSequence\[complex \| bytes \| str\]", "ArrayLike", text)
+    text = re.sub(r"\bUnion\[(\w+)\]", r"\1", text)
+    return re.sub(r"(^|: )'([^']*)'|'(?=[\w.]*[A-Z])([^']*)'", r"\1\2\3", text)
 
 
 def _docstring(doc: str) -> list[str]:
