@@ -29,6 +29,13 @@ PROVIDERS += [
 ]
 #: Public names that are modules of features.
 PACKAGES = {"analysis": "analysis.analysis", "view": "view"}
+#: Public name of the version before -> its name now.
+FORMER_NAMES = {
+    "atoms_of": "to_atoms",
+    "integrator": "register_integrator",
+    "resolve": "with_defaults",
+    "trust": "trust_file",
+}
 
 
 def __getattr__(name: str) -> object:
@@ -38,4 +45,9 @@ def __getattr__(name: str) -> object:
         from importlib.metadata import version
 
         return version("rigidmd")
+    if name in FORMER_NAMES:
+        from rigidmd.core.user_warnings import warn_renamed
+
+        warn_renamed(f"rigidmd.{name}", f"rigidmd.{FORMER_NAMES[name]}")
+        return _load(FORMER_NAMES[name])
     return _load(name)

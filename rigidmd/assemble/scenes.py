@@ -28,9 +28,9 @@ SOURCE = "atoms"  # in messages
 SHAPES = {"FixLinearTriatomic", "FixInternals"}
 
 
-def atoms_of(scene: MolecularScene) -> "ase.Atoms":
+def to_atoms(scene: MolecularScene) -> "ase.Atoms":
     """The start of a run as an `ase.Atoms`, before overlaps are removed: see `Results.atoms`.
-    Raises as `rigidmd.resolve`."""
+    Raises as `rigidmd.with_defaults`."""
     system = build(scene)
     return atoms_of_system(system, system.state)
 

@@ -35,7 +35,7 @@ def describe_stage(stage: Stage) -> list[str]:
             f"{stage.label}: to a minimum of {what}. No time passes and momenta do not change",
             (
                 f"limits: {', '.join(limits[:-1])} and {limits[-1]}. At most"
-                f" {stage.most_iterations} iterations"
+                f" {stage.max_iterations} iterations"
             ),
         ]
     length = f"{stage.duration:g} ps"

@@ -175,7 +175,7 @@ class System:
     def position_dependent(self) -> list[str]:
         """Names of the terms whose energy depends on positions in the lab, which exclude a
         barostat. A field is among them only if a molecule has a net charge."""
-        return [name for name, term in self.terms.items() if trait(term, "tied_to_places")]
+        return [name for name, term in self.terms.items() if trait(term, "absolute_positions")]
 
     @cached_property
     def quantities(self) -> dict[str, Quantity]:

@@ -28,6 +28,7 @@ from rigidmd.compile import (
     task,
 )
 from rigidmd.core.state import EXAMPLE, OK, TALLY_SIZE, Load, State, no_load
+from rigidmd.core.user_warnings import warn_renamed
 
 
 class Setup(NamedTuple):
@@ -51,7 +52,7 @@ class Term:
     #: Components (3,) of the total momentum that it changes; None unless it is an external field.
     changes_momentum: np.ndarray | None = None
     #: Whether its energy depends on positions in the lab, which excludes a barostat.
-    tied_to_places = False
+    absolute_positions = False
     #: Whether it is an interaction of charges.
     acts_on_charges = False
     #: Whether its energy depends on time; then there is an implementation of `power` or
@@ -111,7 +112,7 @@ class Term:
 
 @overload
 def trait(
-    term: object, name: Literal["tied_to_places", "acts_on_charges", "time_dependent"]
+    term: object, name: Literal["absolute_positions", "acts_on_charges", "time_dependent"]
 ) -> bool: ...
 @overload
 def trait(term: object, name: Literal["changes_momentum", "scratch"]) -> np.ndarray | None: ...
@@ -131,6 +132,9 @@ def trait(term: object, name: Literal["passes"]) -> "Callable[[Evaluation], list
 def trait(term: object, name: str) -> object:
     """An attribute of a term, its workspace or the class of either, else the attribute of
     `Term`."""
+    if name == "absolute_positions" and hasattr(term, "tied_to_places"):
+        warn_renamed(f"{type(term).__name__}.tied_to_places", name)
+        return term.tied_to_places
     if hasattr(term, name):
         return getattr(term, name)
     default = getattr(Term, name)

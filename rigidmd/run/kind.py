@@ -182,7 +182,7 @@ def kinds() -> list[Kind]:
     ]
 
 
-def resolve(scene: AnyScene) -> AnyScene:
+def with_defaults(scene: AnyScene) -> AnyScene:
     """The same scene with all defaults, which runs to the same bits. The integrator "auto" stays
     until a run has chosen one.
 

@@ -520,21 +520,21 @@ class RunLoop:
         moment = Moment(self._simulation, position.first + done, time, position.segment)
         for observer, now in zip(self._observers.values(), due, strict=True):
             if now and not (observer.once and self._part.is_replaced(moment)):
-                self._call_observer(observer, observer.see, moment)
+                self._call_observer(observer, observer.observe, moment)
         self._check_process()
 
     def _call_observer(
         self, observer: Observer, method: Callable[..., None], *arguments: object
     ) -> None:
         """Call a method of an observer, unless the observer has failed before. Its error ends the
-        run, which raises it when all files are complete. An error of a figure becomes a note. `see`
-        may raise the errors of this package."""
+        run, which raises it when all files are complete. An error of a figure becomes a note.
+        `observe` may raise the errors of this package."""
         if observer in self._failed_before:
             return
         try:
             method(*arguments)
         except Exception as error:  # a user's observer may raise anything
-            if isinstance(error, RigidMDError) and method == observer.see:
+            if isinstance(error, RigidMDError) and method == observer.observe:
                 raise
             self._failed_before.append(observer)
             reason = f"{type(error).__name__}: {' '.join(str(error).split())}"

@@ -365,8 +365,8 @@ def minimise(
         )
         if converged or ended_by:
             break
-        if iterations == stage.most_iterations:
-            ended_by = f"most_iterations = {stage.most_iterations}"
+        if iterations == stage.max_iterations:
+            ended_by = f"max_iterations = {stage.max_iterations}"
         elif stop():
             ended_by = "interrupted"
         elif (lower := descent.step(point)) is not None:

@@ -359,7 +359,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         k = self.record.position.segment
         stage = self.scene.stages[k]
         with progress_of(
-            stage.most_iterations, "iterations", shown=progress, spot=self.simulation._spot
+            stage.max_iterations, "iterations", shown=progress, spot=self.simulation._spot
         ) as bar:
 
             def advance(count: float) -> None:

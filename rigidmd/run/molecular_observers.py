@@ -36,7 +36,7 @@ class LogFile(GrowingFile[Log]):
     def begin(self, run: "Simulation") -> None:
         self._file = Log(run.path(self._names[0]), self._columns, self.kept)
 
-    def see(self, moment: Moment) -> None:
+    def observe(self, moment: Moment) -> None:
         not_none(self._file).write(moment.sample)
 
     def end(self, run: "Simulation", results: "Results") -> None:
@@ -58,11 +58,11 @@ class PressureTensor(LogFile):
         if run.folder is not None:
             super().begin(run)
 
-    def see(self, moment: Moment) -> None:
+    def observe(self, moment: Moment) -> None:
         if self._file is None:
             self._rows.append(row_of(moment.sample, TENSOR))
         else:
-            super().see(moment)
+            super().observe(moment)
 
     def end(self, run: "Simulation", results: "Results") -> None:
         if self._file is None:
@@ -108,7 +108,7 @@ class Sampler(Observer):
             self.samples.row(self._begins.get(stage, -1)).conserved if len(self.samples) else None
         )
 
-    def see(self, moment: Moment) -> None:
+    def observe(self, moment: Moment) -> None:
         run, now, samples = self._run, moment.sample, self.samples
         since = self._begins.setdefault(now.stage, max(0, len(samples) - 1))
         samples.append(now)
@@ -177,7 +177,7 @@ class StepWatch(Observer):
         # samples come at least as often
         self.steps = every if max(of_samples, default=0.0) > every else None
 
-    def see(self, moment: Moment) -> None:
+    def observe(self, moment: Moment) -> None:
         if (load := self._run.engine.load) is not None:  # forces have been evaluated
             _check_next_step(self._run, self._check, load, self._run.scene.stages[moment.stage])
 

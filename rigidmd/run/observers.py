@@ -1,10 +1,11 @@
 """Observers are called between the steps of a run. They read its state and never change it.
 
-An observer is any object with an `interval` and a method `see`. `Observer` has all other methods,
-which have no effect. `see` is called every `interval` of time, counted in steps of each segment, or
-every `steps` steps, independent of the interval of results, and with `ends` also at the last moment
-of every segment. A time at which a minimisation starts has two states: with `once` only the second
-is observed. No observer depends on another: data that several need belong to the moment or run.
+An observer is any object with an `interval` and a method `observe`. `Observer` has all other
+methods, which have no effect. `observe` is called every `interval` of time, counted in steps of
+each segment, or every `steps` steps, independent of the interval of results, and with `ends` also
+at the last moment of every segment. A time at which a minimisation starts has two states: with
+`once` only the second is observed. No observer depends on another: data that several need belong to
+the moment or run.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -16,6 +17,7 @@ import numpy as np
 from pydantic import Field
 
 from rigidmd.core.state import State
+from rigidmd.core.user_warnings import warn_renamed
 from rigidmd.formats.atoms import Frame
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import SCENE
@@ -114,7 +116,7 @@ class Observer:
     def begin(self, run: "Simulation") -> None:
         """Called before the first step. The folder exists."""
 
-    def see(self, moment: Moment) -> None:
+    def observe(self, moment: Moment) -> None:
         """Observe a moment.
 
         Raises
@@ -122,6 +124,10 @@ class Observer:
         SimulationError
             To stop the run.
         """
+
+    def see(self, moment: Moment) -> None:
+        """`observe` by its name of the version before."""
+        type(self).observe(self, moment)
 
     def memory(self) -> Checkpoint:
         """The data that `resume` needs, for a checkpoint. Its files must be on the disk when it
@@ -154,15 +160,21 @@ class Observer:
 
 
 def as_observer(value: object) -> Observer:
-    """An observer, or one that calls an object with `see` and `interval` (or `steps`, `ends`),
+    """An observer, or one that calls an object with `observe` and `interval` (or `steps`, `ends`),
     which may also have any of the other methods and attributes of `Observer` but `remembers`.
     Raises TypeError."""
+    method = getattr(value, "observe", None)
+    if getattr(type(value), "see", Observer.see) is not Observer.see:
+        warn_renamed(f"{type(value).__name__}.see", "observe")
+        method = value.see  # pyright: ignore[reportAttributeAccessIssue]
+        if isinstance(value, Observer):
+            value.observe = method
     if isinstance(value, Observer):
         return value
     is_timed = any(hasattr(value, name) for name in ("interval", "steps", "ends"))
-    if not is_timed or not callable(getattr(value, "see", None)):
+    if not is_timed or not callable(method):
         raise TypeError(
-            f"{value!r:.60} is not an observer: it needs an interval and a method see(moment). "
+            f"{value!r:.60} is not an observer: it needs an interval and a method observe(moment). "
             "rigidmd.Every(interval, function) makes one of a function"
         )
     # its name is in messages and checkpoints
@@ -172,7 +184,7 @@ def as_observer(value: object) -> Observer:
         for name in dir(Observer)
         if name[0] != "_" and hasattr(value, name)
     }
-    vars(observer).update(attributes)
+    vars(observer).update(attributes | {"observe": method})
     return observer
 
 
@@ -185,7 +197,7 @@ class Every(Observer):
         self.interval = above_zero(interval, "the interval of Every")
         self.function = function
 
-    def see(self, moment: Moment) -> None:
+    def observe(self, moment: Moment) -> None:
         self.function(moment)
 
 
@@ -307,7 +319,7 @@ class Frames(GrowingFile[OpenTrajectory]):
             kept=self.kept,
         )
 
-    def see(self, moment: Moment) -> None:
+    def observe(self, moment: Moment) -> None:
         system = self._run.system
         state = self._run._part.state
         if self._file is not None:

@@ -4,9 +4,7 @@ import atexit
 import contextlib
 import os
 import signal
-import sys
 import time as clock
-import warnings
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from math import inf
@@ -28,7 +26,8 @@ from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.core.display import Displayed
 from rigidmd.core.state import State
 from rigidmd.core.toml import Json
-from rigidmd.errors import RigidMDError, RigidMDWarning, SceneError
+from rigidmd.core.user_warnings import warn_user
+from rigidmd.errors import RigidMDError, SceneError
 from rigidmd.io import folder as run_folder
 from rigidmd.io.progress import DisplayArea, announce, is_shown
 from rigidmd.io.scene_file import write_scene
@@ -80,17 +79,6 @@ SceneT = TypeVar("SceneT")
 _BEGUN: "weakref.WeakSet[Simulation]" = weakref.WeakSet()
 
 
-def _as_warning(sentence: str) -> None:
-    """Issue a Python warning that names the calling line outside this package."""
-    package = str(Path(__file__).parent.parent)
-    level = 1
-    frame = sys._getframe()
-    while frame is not None and frame.f_code.co_filename.startswith(package):
-        level = level + 1
-        frame = frame.f_back
-    warnings.warn(sentence, RigidMDWarning, stacklevel=level)
-
-
 def _as_scene(scene: object) -> Scene:
     """A scene, or the scene in a file."""
     if isinstance(scene, str | Path):
@@ -117,7 +105,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         Replace an earlier run in that folder
     observers
         user-defined, called between steps: `Every`, `LivePlot`, any object with `interval` and
-        `see(moment)`
+        `observe(moment)`
     `say`
         Called with a sentence before something slow (compiling, pilot runs). Default: printed with
         the progress
@@ -182,7 +170,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         *,
         observers: object = (),
         say: Callable[[str], object] | None = None,
-        warn: Callable[[str], object] = _as_warning,
+        warn: Callable[[str], object] = warn_user,
         resume: bool = False,
         walltime: float | None = None,
         forces: "AnyForce | Sequence[AnyForce] | None" = None,

@@ -104,7 +104,7 @@ class IntegratorRow(Section):
 _REGISTERED: dict[str, IntegratorRow] = {}
 
 
-def integrator(
+def register_integrator(
     name: str,
     *,
     order: int,
@@ -136,7 +136,7 @@ def integrator(
 
     Examples
     --------
-        rigidmd.integrator(
+        rigidmd.register_integrator(
             "ruth_4", order=4, steps=[1.3512, -1.7024, 1.3512], source="Forest & Ruth 1990"
         )
     """

@@ -51,7 +51,7 @@ USED = {
     **dict.fromkeys(("duration_ps", "timestep_fs", "integrator", "rotor"), MOVING),
     **{
         key: {"minimise"}
-        for key in ("force_limit_kJ_mol_A", "torque_limit_kJ_mol", "most_iterations")
+        for key in ("force_limit_kJ_mol_A", "torque_limit_kJ_mol", "max_iterations")
     },
     **{key: {"npt", "nph"} for key in ("barostat", "compressibility_per_bar")},
     **{key: {"nvt", "npt"} for key in ("temperature_K", "thermostat")},
@@ -159,7 +159,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     pressure_limit_bar: Positive = 1.0
     """With minimise and pressure_bar: largest deviation of the pressure at convergence. With the
     compressibility of water, 1 bar changes the volume by 5e-5"""
-    most_iterations: Count = 5000
+    max_iterations: Count = 5000
     """With minimise: maximum number of iterations. The minimisation then stops with a warning"""
 
     @model_validator(mode="before")

@@ -24,7 +24,8 @@ from pydantic_core import ErrorDetails, PydanticKnownError, core_schema
 
 from rigidmd.core.plain_text import did_you_mean, plain_letters
 from rigidmd.core.toml import Json, line_of, shorten_repr, shorten_text, values_in
-from rigidmd.errors import MOST_SHOWN, option
+from rigidmd.core.user_warnings import warn_renamed
+from rigidmd.errors import MOST_SHOWN, RigidMDWarning, option
 from rigidmd.scene.hints import KEY_WITH_UNIT, OTHER_UNITS, hint_on_key, in_british, models_in
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
@@ -335,18 +336,26 @@ def exact_names(data: object, annotation: object) -> object:
     }
     return {
         key: exact_names(value, fields.get(key) if fields else annotation)
-        for key, value in _british_keys(data, fields).items()
+        for key, value in _current_keys(data, fields).items()
     }
 
 
-def _british_keys(data: dict, known: Container[str]) -> dict:
-    """Data in which an unknown key in American spelling is the known key in British spelling."""
+#: Key of the version before -> its name now.
+FORMER_KEYS = {"most_iterations": "max_iterations"}
+
+
+def _current_keys(data: dict, known: Container[str]) -> dict:
+    """Data in which an unknown key in American spelling, or of the version before, is the known
+    key."""
     names = {
-        key: in_british(key)
+        key: new
         for key in data
-        if isinstance(key, str) and key not in known and in_british(key) in known
+        if isinstance(key, str) and key not in known
+        if (new := FORMER_KEYS.get(key, in_british(key))) in known and new not in data
     }
-    return {(key if names.get(key) in data else names.get(key, key)): data[key] for key in data}
+    for old in FORMER_KEYS.keys() & names:
+        warn_renamed(f"the key {old}", FORMER_KEYS[old], RigidMDWarning)
+    return {names.get(key, key): value for key, value in data.items()}
 
 
 @cache

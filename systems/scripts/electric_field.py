@@ -10,7 +10,7 @@ class ElectricField(rigidmd.Force):
     """A field in V/nm, which conserves the momentum of neutral molecules."""
 
     changes_momentum = (False, False, False)
-    tied_to_places = False  # the energy does not depend on positions: the box may change
+    absolute_positions = False  # the energy does not depend on positions: the box may change
 
     def __init__(self, field):
         self.field = E_PER_V_PER_NM * np.array(field, float)

@@ -13,7 +13,7 @@ class Umbrella(NamedTuple):
     height: float  # Å
     stiffness: float  # u/ps²; 100 u/ps² are 1 kJ/mol/Å²
     changes_momentum = (False, False, True)
-    tied_to_places = True
+    absolute_positions = True
 
 
 @rigidmd.compiled_force(Umbrella)

@@ -411,13 +411,13 @@ def test_check_warns_of_an_order_that_the_truncation_does_not_allow(
 
 
 def test_the_scene_of_a_run_has_no_keys_without_an_effect(tmp_path):
-    stages = [{"ensemble": "minimise", "most_iterations": 2}, NVT]
+    stages = [{"ensemble": "minimise", "max_iterations": 2}, NVT]
     ran = scene(stages=stages)
     Simulation(ran, folder=tmp_path / "run").run()
     tables = tomllib.loads((tmp_path / "run" / "scene.toml").read_text())
-    limits = {"most_iterations", "force_limit_kJ_mol_A", "torque_limit_kJ_mol"}
+    limits = {"max_iterations", "force_limit_kJ_mol_A", "torque_limit_kJ_mol"}
     assert set(tables["stages"][0]) == {"ensemble", *limits}
-    assert not {"nose_hoover_links", "pressure_coupling", "most_iterations"} & set(
+    assert not {"nose_hoover_links", "pressure_coupling", "max_iterations"} & set(
         tables["stages"][1]
     )
     assert not {"damping_per_A", "reaction_field_permittivity"} & set(tables["forces"])

@@ -14,27 +14,30 @@ from rigidmd.scene import MolecularScene, Scene
 def test_when_total_momentum_is_taken_out():
     pme = {"electrostatics": "pme", "cutoff_A": 9.0}
     frozen = [{"model": "spce", "count": 2}, {"model": "argon", "count": 2, "frozen": True}]
-    assert rigidmd.resolve(argon()).run.remove_momentum_interval_ps is False
-    assert rigidmd.resolve(argon(forces=pme)).run.remove_momentum_interval_ps == 1.0
+    assert rigidmd.with_defaults(argon()).run.remove_momentum_interval_ps is False
+    assert rigidmd.with_defaults(argon(forces=pme)).run.remove_momentum_interval_ps == 1.0
     assert (
-        rigidmd.resolve(
+        rigidmd.with_defaults(
             argon(forces=pme | {"electrostatics": "ewald"})
         ).run.remove_momentum_interval_ps
         is False
     )
     assert (
-        rigidmd.resolve(
+        rigidmd.with_defaults(
             argon(forces=pme, run={"remove_momentum_interval_ps": False})
         ).run.remove_momentum_interval_ps
         is False
     )
     assert (
-        rigidmd.resolve(
+        rigidmd.with_defaults(
             small_scene({}, 25.0, molecules=frozen, forces=pme)
         ).run.remove_momentum_interval_ps
         is False
     )
-    assert rigidmd.resolve(small_scene({"argon": 3}, None)).run.remove_momentum_interval_ps is False
+    assert (
+        rigidmd.with_defaults(small_scene({"argon": 3}, None)).run.remove_momentum_interval_ps
+        is False
+    )
     nvt = {"ensemble": "nvt", "temperature_K": 90.0, "duration_ps": 1.0}
     for thermostat, removed in [
         ("velocity_rescaling", 1.0),
@@ -43,7 +46,7 @@ def test_when_total_momentum_is_taken_out():
         ("andersen", False),
     ]:
         scene = small_scene({"argon": 20}, 25.0, stages=[nvt | {"thermostat": thermostat}])
-        assert rigidmd.resolve(scene).run.remove_momentum_interval_ps == removed
+        assert rigidmd.with_defaults(scene).run.remove_momentum_interval_ps == removed
     with pytest.raises(SceneError, match="total momentum is not conserved with frozen molecules"):
         small_scene({}, 25.0, molecules=frozen, run={"remove_momentum_interval_ps": 0.1})
     text = describe(argon(run={"remove_momentum_interval_ps": 0.2}))
@@ -89,7 +92,7 @@ def test_the_scene_that_a_run_writes_holds_every_number_it_used(electrostatics, 
     assert "ewald_accuracy" not in again.forces.model_fields_set
     assert again.start.temperature_K == 300.0
     assert again.forces.skin_A == 1.9
-    assert rigidmd.resolve(scene) == first.system.scene
+    assert rigidmd.with_defaults(scene) == first.system.scene
     assert again.model_dump() == first.system.scene.model_dump()
     repeated = Simulation(again).run()
     assert same_bits(first.state, repeated.state)
@@ -100,8 +103,8 @@ def test_the_scene_that_a_run_writes_holds_every_number_it_used(electrostatics, 
 def test_a_resolved_scene_has_every_number_and_resolves_to_itself(electrostatics, angles):
     box = {"lengths_A": [22.0, 23.0, 24.0], "angles_deg": angles}
     scene = small_scene({"spce": 30}, None, box=box, forces={"electrostatics": electrostatics})
-    resolved = rigidmd.resolve(scene)
-    assert rigidmd.resolve(resolved) == resolved != scene
+    resolved = rigidmd.with_defaults(scene)
+    assert rigidmd.with_defaults(resolved) == resolved != scene
     for key in {"skin_A", *DECIDED.get(electrostatics, DECIDED["reaction_field"])}:
         assert getattr(resolved.forces, key) is not None, key
     assert resolved.forces.ewald_accuracy is None  # what follows from it is there
@@ -109,11 +112,11 @@ def test_a_resolved_scene_has_every_number_and_resolves_to_itself(electrostatics
     assert resolved.start.temperature_K == 300.0
     assert resolved.output.velocities is False
     again = MolecularScene.model_validate(resolved.model_dump(exclude_none=True))
-    assert rigidmd.resolve(again) == again
+    assert rigidmd.with_defaults(again) == again
 
 
 def test_without_a_box_there_is_no_cutoff_to_decide():
-    resolved = rigidmd.resolve(small_scene({"spce": 3}, None))
+    resolved = rigidmd.with_defaults(small_scene({"spce": 3}, None))
     assert resolved.forces.cutoff_A is resolved.forces.switch_start_A is None
 
 
@@ -122,13 +125,13 @@ def test_a_cell_that_tilts_too_much_leaves_only_the_grid_open():
     box = {"lengths_A": [24.0, 24.0, 24.0], "angles_deg": [60.0, 60.0, 45.0]}
     forces = {"electrostatics": "pme", "cutoff_A": 8.0}
     scene = small_scene({"spce": 30}, None, box=box, forces=forces)
-    resolved = rigidmd.resolve(scene)
-    assert rigidmd.resolve(resolved) == resolved
+    resolved = rigidmd.with_defaults(scene)
+    assert rigidmd.with_defaults(resolved) == resolved
     assert resolved.forces.pme_grid is None
     first, again = (build(each).terms["coulomb_reciprocal"] for each in (scene, resolved))
     assert (resolved.forces.ewald_accuracy, resolved.forces.pme_order) == (5e-5, first.order)
     assert (first.grid, first.order) == (again.grid, again.order)
-    even = rigidmd.resolve(
+    even = rigidmd.with_defaults(
         small_scene({"spce": 30}, None, box=box, forces=forces | {"pme_grid": [60, 60, 60]})
     )
     assert (even.forces.pme_grid, even.forces.ewald_accuracy) == ((60, 60, 60), None)

@@ -146,7 +146,7 @@ def test_kicks_side_by_side_are_one_kick(moving, pair):
 class Springs(rigidmd.Force):
     """Springs of each site to its position at the start."""
 
-    tied_to_places = True
+    absolute_positions = True
 
     def on_sites(self, x, state):
         self.calls = getattr(self, "calls", 0) + 1
@@ -338,7 +338,9 @@ def test_adding_an_integrator_from_python(monkeypatch):
     with pytest.raises(SceneError, match="is 'jump', must be 'velocity_verlet', "):
         Scene.read("systems/heavy_top_3.toml", {"run.integrator": "jump"})
     assert (
-        rigidmd.integrator("jump", order=4, steps=SCHEMES["yoshida_4"].drifts, source="Yoshida")
+        rigidmd.register_integrator(
+            "jump", order=4, steps=SCHEMES["yoshida_4"].drifts, source="Yoshida"
+        )
         == "jump"
     )
     scene = Scene.read("systems/heavy_top_3.toml", {"run.integrator": "jump"})
@@ -350,7 +352,9 @@ def test_adding_an_integrator_from_python(monkeypatch):
         for trial in measure_accuracy(scene, timesteps=[0.01], span=0.1, repeats=1).trials
     }
     assert {"jump", "velocity_verlet", "dop853"} <= names
-    rigidmd.integrator("jump", order=2, steps=[0.5, 0.5])  # the scene is a value: it keeps its row
+    rigidmd.register_integrator(
+        "jump", order=2, steps=[0.5, 0.5]
+    )  # the scene is a value: it keeps its row
     assert scene.run.scheme.flows == SCHEMES["yoshida_4"].flows
     again = Scene.from_dict(scene.model_dump(exclude_none=True))
     assert again.run.scheme == scene.run.scheme
@@ -389,7 +393,7 @@ def test_adding_an_integrator_from_python(monkeypatch):
 def test_rows_that_cannot_be(row, message):
     row = tomllib.loads(row)
     with pytest.raises(SceneError, match=message):
-        rigidmd.integrator(**({"name": "mine", "order": 2} | row))
+        rigidmd.register_integrator(**({"name": "mine", "order": 2} | row))
     stage = {"duration_ps": 1.0, "integrator": row.get("name", "mine")}
     with pytest.raises(SceneError, match=r"integrators\.0") as caught:
         small_scene(

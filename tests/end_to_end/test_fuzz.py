@@ -99,7 +99,7 @@ ewald_accuracy = 1e-3
 tail_correction = true
 [[stages]]
 ensemble = "minimise"
-most_iterations = 5
+max_iterations = 5
 [[stages]]
 ensemble = "npt"
 temperature_K = 300.0

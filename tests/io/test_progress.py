@@ -94,7 +94,7 @@ def test_the_time_left_is_of_the_steps_of_this_run(monkeypatch, capsys, tmp_path
 
     def lines(duration, **options):
         stages = [
-            {"ensemble": "minimise", "most_iterations": 2},
+            {"ensemble": "minimise", "max_iterations": 2},
             {"duration_ps": 0.02},
             {"duration_ps": duration},
         ]

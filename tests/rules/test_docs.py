@@ -39,7 +39,7 @@ from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
 from rigidmd.core.shipped import CHAPTERS, DOCS, GUIDES, SECTIONS, find_example
 from rigidmd.errors import SceneError
 from rigidmd.formats import BY_EXTENSION, all_formats
-from rigidmd.run.kind import resolve
+from rigidmd.run.kind import with_defaults
 from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override
 from rigidmd.scene.models import read_parameters
 
@@ -186,7 +186,7 @@ class Reader:
                 assert cli.main(["models", file]) == 0
             return
         if {"molecules", "stages"} <= set(data) or {"body", "run"} <= set(data):
-            resolve(Scene.from_dict(data, "."))
+            with_defaults(Scene.from_dict(data, "."))
             return
         if (named := data.get("structure", {}).get("file")) is not None:
             Path(named).touch()  # a fragment is not built: it is enough that the file is there

@@ -306,7 +306,7 @@ def test_what_it_keeps_and_what_it_accounts_for():
     class Look(Every):
         once = False  # both moments of a time, before and after the minimisation
 
-        def see(self, moment):
+        def observe(self, moment):
             state = moment.state
             seen.append(
                 (
@@ -374,7 +374,7 @@ def test_models_with_bare_charges_are_minimised_from_every_lattice(name, seeds):
             {name: 64},
             float(edge),
             forces={"cutoff_A": 6.0},
-            stages=[stage_of(most_iterations=400)],
+            stages=[stage_of(max_iterations=400)],
             seed=seed,
         )
         with warnings.catch_warnings():

@@ -47,14 +47,14 @@ def test_it_begins_from_overlaps():
 
 
 def test_it_states_how_far_it_came():
-    scene = small_scene({"spce": 10}, 18.5, stages=[stage_of(most_iterations=3)])
+    scene = small_scene({"spce": 10}, 18.5, stages=[stage_of(max_iterations=3)])
     with pytest.warns(
         RigidMDWarning,
-        match=r"stages.0: the minimisation has not converged after 3 iterations .*most_iterations = 3",
+        match=r"stages.0: the minimisation has not converged after 3 iterations .*max_iterations = 3",
     ):
         results, found = minimum_of(scene)
     assert not found["converged"]
-    assert found["ended_by"] == "most_iterations = 3"
+    assert found["ended_by"] == "max_iterations = 3"
     assert found["iterations"] == 3
     assert found["largest_force_kJ_mol_A"] > 0.1
     assert any(
@@ -138,7 +138,7 @@ def test_a_box_that_becomes_too_small_for_the_cutoff():
         ),
         ([stage_of(pressure_bar=(1.0, 2.0))], {}, "one pressure, not one that changes"),
         ([stage_of(pressure_bar=(1.0, 2.0, 3.0))], {}, "pressure_coupling = 'anisotropic'"),
-        ([stage_of(most_iterations=0)], {}, "most_iterations"),
+        ([stage_of(max_iterations=0)], {}, "max_iterations"),
         ([stage_of(force_limit_kJ_mol_A=0.0)], {}, "force_limit_kJ_mol_A"),
         (
             [{"duration_ps": 1.0, "force_limit_kJ_mol_A": 0.2}],
@@ -267,7 +267,7 @@ SEVERAL = [
     stage_of(name="a"),
     stage_of(name="b"),
     SHORT,
-    stage_of(name="c", most_iterations=3),
+    stage_of(name="c", max_iterations=3),
     SHORT,
 ]
 EVERY_STEP_OR_TWO = {
@@ -425,9 +425,9 @@ def test_compiling_is_not_minimising(monkeypatch):
     monkeypatch.setattr(CpuEngine, "evaluate", evaluate_and_record)
     monkeypatch.setattr(molecular, "minimise", minimise_and_record)
     stages = [
-        stage_of(most_iterations=2, **TIGHT),
+        stage_of(max_iterations=2, **TIGHT),
         {"duration_ps": 0.002},
-        stage_of(most_iterations=2),
+        stage_of(max_iterations=2),
     ]
     Simulation(small_scene({"argon": 20}, 20.0, stages=stages, precision="mixed"), warn=str).run()
     assert order.count("minimise") == 2

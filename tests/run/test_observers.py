@@ -115,7 +115,7 @@ def scene_of_both(request):
     return "top", Scene.read(ROOT / "systems" / "heavy_top_3.toml", changed)
 
 
-@pytest.mark.parametrize("method", ["see", "end"])
+@pytest.mark.parametrize("method", ["observe", "end"])
 def test_an_observer_that_fails_costs_no_file_of_another(tmp_path, scene_of_both, method):
     kind, scene = scene_of_both
     seen = []
@@ -127,19 +127,21 @@ def test_an_observer_that_fails_costs_no_file_of_another(tmp_path, scene_of_both
     there = {path.name for path in (tmp_path / "out").iterdir()}
     assert there >= FILES_OF[kind]
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert summary["interrupted"] == (method == "see")
+    assert summary["interrupted"] == (method == "observe")
     assert sum("Failing failed at" in note for note in summary["notes"]) == 1
     assert {Path(name).name for name in summary["files"]} <= there
     assert seen[-1].step == seen[-2].step  # also those after it saw the moment
     again = Simulation(
         scene, tmp_path / "out", observers=[Every(0.002, seen.append)] * 3, resume=True, warn=str
     )
-    if method == "see" and kind == "argon":
+    if method == "observe" and kind == "argon":
         assert not again.run().interrupted
 
 
 def test_an_error_is_not_hidden_by_those_that_follow_from_it(tmp_path, scene_of_both):
-    run = Simulation(scene_of_both[1], tmp_path / "out", observers=[FailingTwice("see")], warn=str)
+    run = Simulation(
+        scene_of_both[1], tmp_path / "out", observers=[FailingTwice("observe")], warn=str
+    )
     with pytest.raises(ValueError, match="it does not work"):
         run.run()
 
@@ -151,7 +153,7 @@ def test_a_picture_that_fails_is_a_note(tmp_path, scene_of_both, monkeypatch):
         raise ValueError("ParseException: no mathematics")
 
     monkeypatch.setattr(style, "save_files", fail)
-    pictures = [Failing("see", draws=True), Failing("end", draws=True)]
+    pictures = [Failing("observe", draws=True), Failing("end", draws=True)]
     notes = []
     results = Simulation(scene, tmp_path / "out", observers=pictures, warn=notes.append).run()
     assert not results.interrupted

@@ -531,7 +531,7 @@ class Plain:
     def __init__(self):
         self.times = []
 
-    def see(self, moment):
+    def observe(self, moment):
         self.times.append(moment.time)
 
 
@@ -553,7 +553,7 @@ def test_an_observer_is_any_object_with_an_interval_and_see(tmp_path):
     ).read_text() == "5" and tmp_path / "out" / "times.txt" in results.files
     argon(observers=one).run()
     assert len(one.times) == 10
-    for wrong in (3, print, object(), [one, "see"]):
+    for wrong in (3, print, object(), [one, "observe"]):
         with pytest.raises(TypeError, match="is not an observer"):
             argon(observers=wrong)
 
@@ -701,13 +701,13 @@ def test_messages_name_arguments_of_python_not_options(tmp_path):
         f"sets={{'{first}': [280, 290]}} or sets={{'seed': range(1, 9)}}": lambda: rigidmd.sweep(
             path, {"seed": 1}
         ),
-        "call rigidmd.trust(": lambda: rigidmd.resolve(
+        "call rigidmd.trust_file(": lambda: rigidmd.with_defaults(
             Scene.read(path, {"forces.custom": [entry]})
         ),
         "names by module: it names none": lambda: rigidmd.sweep(
             path, {"seed": [1, 2]}, trust=[tmp_path / "spring.py"]
         ),
-        "there is no such file": lambda: rigidmd.trust(tmp_path / "other.py"),
+        "there is no such file": lambda: rigidmd.trust_file(tmp_path / "other.py"),
     }.items():
         with pytest.raises(SceneError) as caught:
             call()

@@ -25,7 +25,7 @@ from rigidmd.units import BOLTZMANN
 def test_every_system_runs_a_few_steps(path, tmp_path):
     assert path.read_text().startswith("# ")
     scene = Scene.read(path)
-    stages = rigidmd.resolve(scene).stages
+    stages = rigidmd.with_defaults(scene).stages
     moving = [k for k, stage in enumerate(stages) if not stage.is_minimisation]
     short = {f"stages.{k}.duration_ps": 8 * stages[k].step for k in moving} | {
         "output.log_interval_ps": 0.004,

@@ -194,7 +194,7 @@ def test_adding_a_thermostat_and_a_barostat(monkeypatch):
                 40.0,
                 stages=[{k: v for k, v in (stage | wrong).items() if v is not None}],
             )
-    scene = rigidmd.resolve(
+    scene = rigidmd.with_defaults(
         small_scene({"argon": 20}, 40.0, forces={"lennard_jones": False}, stages=[stage])
     )
     assert (scene.stages[0].thermostat_time_ps, scene.stages[0].barostat_time_ps) == (0.25, None)

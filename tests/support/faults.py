@@ -118,7 +118,7 @@ def scene_of(rng: random.Random, wide: bool) -> tuple[str, dict]:
         npt = nvt | {"ensemble": "npt", "pressure_bar": 1.0, "barostat_interval_ps": 0.007}
         others = [{"ensemble": "nph", "pressure_bar": 1.0}, npt, npt | {"barostat": "monte_carlo"}]
         others += [nvt | {"thermostat": name} for name in ("langevin", "nose_hoover", "andersen")]
-        stages += [{"ensemble": "minimise", "most_iterations": 5}, *others]
+        stages += [{"ensemble": "minimise", "max_iterations": 5}, *others]
     chosen = [dict(rng.choice(stages)) for _ in range(rng.randint(1, 3))]
     for stage in chosen:
         if stage["ensemble"] != "minimise":

@@ -55,7 +55,7 @@ NPT = NVT | {
 }
 NVE = {"duration_ps": 0.1, "timestep_fs": 2.0}
 NPH = NVE | {"ensemble": "nph", "pressure_bar": 1.0}
-MINIMISE = {"ensemble": "minimise", "most_iterations": 5}
+MINIMISE = {"ensemble": "minimise", "max_iterations": 5}
 
 #: The smallest scene file, to be spoilt.
 GOOD = """\

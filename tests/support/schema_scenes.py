@@ -204,7 +204,7 @@ position_A = [10.0, 10.0, 10.0]
 temperature_K = 300.0
 [[stages]]
 ensemble = "minimise"
-most_iterations = 2
+max_iterations = 2
 force_limit_kJ_mol_A = 0.1
 torque_limit_kJ_mol = 0.1
 [[stages]]

@@ -95,7 +95,7 @@ def short_form(path: Path, folder: Path) -> Path:
         step = scene.run.timestep_s
         changes = {"run.duration_s": STEPS * step, "output.interval_s": 2 * step}
     else:
-        stages = rigidmd.resolve(scene).stages
+        stages = rigidmd.with_defaults(scene).stages
         moving = {k: stage.step for k, stage in enumerate(stages) if not stage.is_minimisation}
         shortest = min(moving.values())
         changes = {f"stages.{k}.duration_ps": STEPS * step for k, step in moving.items()} | {
@@ -212,7 +212,7 @@ def steps_of(scene: Path) -> str:
     if isinstance(resolved, rigidmd.BodyScene):
         step = resolved.run.timestep_s
     else:
-        step = 1e3 * rigidmd.resolve(resolved).stages[-1].step
+        step = 1e3 * rigidmd.with_defaults(resolved).stages[-1].step
     return f"{step / 2:.12g},{step:.12g}"
 
 

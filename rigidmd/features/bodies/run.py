@@ -73,7 +73,7 @@ class Sampler(Observer):
         for state in self.states:
             state_from(state._asdict(), run._part.state, exact=False)
 
-    def see(self, moment: Moment) -> None:
+    def observe(self, moment: Moment) -> None:
         self.states.append(moment.state)
 
 
@@ -102,7 +102,7 @@ class BodyWatch(Observer):
         )
 
     @np.errstate(over="ignore", invalid="ignore")
-    def see(self, moment: Moment) -> None:
+    def observe(self, moment: Moment) -> None:
         system, limits = self._system, self._limits
         state, dt = self._run._part.state, self._run._part.segment.dt
         largest = not_none(limits.orthogonality)

@@ -427,7 +427,7 @@ class CalculatorForce(Force):
             )
         if periodic and not self._has_virial:
             system.notes.append(f"{self.name} has no stress: the pressure does not include it")
-        self.tied_to_places = periodic and not self._has_virial  # type: ignore[misc]
+        self.absolute_positions = periodic and not self._has_virial  # type: ignore[misc]
         self._sites = system.sites
         self.atoms = atoms_of_sites(
             system, system.site_positions(system.state), None, system.state.cell, 0.0

@@ -31,7 +31,7 @@ class Potentials(Feature):
         return user_errors_explained(system)
 
     def trust(self, path: str | Path) -> None:
-        trust.trust(path)
+        trust.trust_file(path)
 
     def unused_files(self, scene: Scene, paths: Sequence[str]) -> list[str]:
         return trust.unused_files(scene, paths)

@@ -16,7 +16,7 @@ class PythonForces(NamedTuple):
     molecules: int
     turns: bool  # whether molecules rotate
     changes_momentum: np.ndarray  # (3,) components of the total momentum that they may change
-    tied_to_places: bool  # whether the energy depends on positions in the lab
+    absolute_positions: bool  # whether the energy depends on positions in the lab
 
     def workspace(self, setup: Setup) -> "PythonForcesWorkspace":
         n = self.molecules

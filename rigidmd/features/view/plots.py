@@ -152,7 +152,7 @@ class LivePlot(Observer):
         check_names(self._columns, described)
         self._spot = DisplayArea() if in_notebook() else None
 
-    def see(self, moment: Moment) -> None:
+    def observe(self, moment: Moment) -> None:
         if clock.monotonic() >= self._due:
             self._draw()
 

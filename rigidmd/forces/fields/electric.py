@@ -37,7 +37,7 @@ class ElectricField(NamedTuple):
         return np.zeros(3, bool) if cancels else self.field != 0
 
     @property
-    def tied_to_places(self) -> bool:
+    def absolute_positions(self) -> bool:
         """Whether its energy depends on positions in the lab: if any molecule has a net charge."""
         return bool(self.charge[self.species].any())
 
@@ -54,7 +54,7 @@ class OscillatingField(NamedTuple):
 
     time_dependent = True
     changes_momentum = ElectricField.changes_momentum
-    tied_to_places = ElectricField.tied_to_places
+    absolute_positions = ElectricField.absolute_positions
 
 
 def term(

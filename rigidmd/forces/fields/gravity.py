@@ -21,7 +21,7 @@ class Gravity(NamedTuple):
     mass: np.ndarray  # (species,) u; 0 for a frozen species
     acceleration: np.ndarray  # (3,) lab frame, Å/ps²
 
-    tied_to_places = True
+    absolute_positions = True
 
     @property
     def changes_momentum(self) -> np.ndarray:

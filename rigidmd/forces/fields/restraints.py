@@ -23,7 +23,7 @@ class Restraints(NamedTuple):
     reference: np.ndarray  # (r, 3) lab frame, Å
     stiffness: np.ndarray  # (3,) along x, y, z, u/ps²
 
-    tied_to_places = True
+    absolute_positions = True
 
     @property
     def changes_momentum(self) -> np.ndarray:

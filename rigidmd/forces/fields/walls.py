@@ -36,7 +36,7 @@ class LennardJonesWalls(NamedTuple):
     cutoff: float  # Å; inf for none
     sites: BodySites | CentralSites
 
-    tied_to_places = True
+    absolute_positions = True
 
     @property
     def changes_momentum(self) -> np.ndarray:
@@ -76,7 +76,7 @@ class HarmonicWalls(NamedTuple):
     sites: BodySites | CentralSites
 
     changes_momentum = LennardJonesWalls.changes_momentum
-    tied_to_places = True
+    absolute_positions = True
 
 
 def term(

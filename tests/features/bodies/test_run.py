@@ -249,8 +249,8 @@ def test_a_run_that_fails_keeps_the_motion_so_far(tmp_path):
 @pytest.mark.parametrize("path", BODIES, ids=lambda path: path.stem)
 def test_resolved_scenes_are_scenes(path, tmp_path):
     scene = Scene.read(path)
-    resolved = rigidmd.resolve(scene)
-    assert rigidmd.resolve(resolved) == resolved == build_body(scene).scene
+    resolved = rigidmd.with_defaults(scene)
+    assert rigidmd.with_defaults(resolved) == resolved == build_body(scene).scene
     assert resolved.output.interval_s == (scene.output.interval_s or scene.run.duration_s / 2000)
     assert resolved.output.trajectory_A_per_m > 0
     assert resolved.watch.orthogonality == 1e-9
@@ -264,15 +264,16 @@ def test_resolved_scenes_are_scenes(path, tmp_path):
 def test_resolved_scenes_hold_what_a_solver_needs(name, integrator, tmp_path):
     """And no formulation of a point, which does not rotate."""
     scene = Scene.read(ROOT / "systems" / f"{name}.toml", {"run.integrator": integrator})
-    resolved = rigidmd.resolve(scene)
-    assert rigidmd.resolve(resolved) == resolved
+    resolved = rigidmd.with_defaults(scene)
+    assert rigidmd.with_defaults(resolved) == resolved
     assert resolved.run.formulation == ("matrix" if build_body(scene).rotates else None)
     tolerance = 1e-10 if integrator == "dop853" else None
     assert resolved.run.relative_tolerance == resolved.run.absolute_tolerance == tolerance
     assert resolved.watch.orthogonality == 0.1
     write_scene(tmp_path, resolved)
     assert (
-        rigidmd.resolve(Scene.read(tmp_path / "scene.toml")).model_dump() == resolved.model_dump()
+        rigidmd.with_defaults(Scene.read(tmp_path / "scene.toml")).model_dump()
+        == resolved.model_dump()
     )
 
 

@@ -46,7 +46,7 @@ def test_any_molecules_come_back(counts, tmp_path):
     from ASE's files."""
     box = {"lengths_A": [20.0, 21.0, 22.0], "angles_deg": [80.0, 100.0, 75.0]}
     system = build(small_scene(counts, None, box=box))
-    atoms = rigidmd.atoms_of(system.scene)
+    atoms = rigidmd.to_atoms(system.scene)
     assert len(atoms) == (system.sites.mass > 0).sum()
     assert atoms.get_masses().sum() == pytest.approx(system.sites.mass.sum())
     settings = {"forces": {"cutoff_A": 9.0}, "stages": [NVE]}
@@ -90,7 +90,7 @@ def test_sites_of_a_geometry_share_names(formula, tmp_path):
     for found in (atoms, ase.io.read(tmp_path / "crystal.cif")):
         system = build(rigidmd.scene_from_atoms(found, [species], forces={"cutoff_A": 6.0}))
         assert len(system.state.position) == 3
-        assert np.sort(rigidmd.atoms_of(system.scene).positions, axis=0) == pytest.approx(
+        assert np.sort(rigidmd.to_atoms(system.scene).positions, axis=0) == pytest.approx(
             np.sort(atoms.positions, axis=0), abs=1e-6
         )
         assert any("largest 0.0000 Å" in note for note in system.notes)
@@ -171,7 +171,7 @@ def test_models_may_be_files_and_tables(tmp_path, monkeypatch):
     Simulation(from_file)._write_scene(tmp_path / "run")
     (tmp_path / "mine.toml").unlink()
     assert (
-        rigidmd.resolve(Scene.read(tmp_path / "run" / "scene.toml")).molecules[0].file
+        rigidmd.with_defaults(Scene.read(tmp_path / "run" / "scene.toml")).molecules[0].file
         == "input_0_mine.toml"
     )
     assert build(heavy).species[0].mass == pytest.approx(light + 2 * (2.014 - 1.008))

@@ -31,7 +31,7 @@ from rigidmd.units import FEMTOSECOND, KJ_PER_MOL
 
 def cluster(model: str, n: int, seed: int = 1) -> Atoms:
     """Molecules without a box, far enough from each other."""
-    return rigidmd.atoms_of(small_scene({model: n}, None, seed=seed))
+    return rigidmd.to_atoms(small_scene({model: n}, None, seed=seed))
 
 
 def test_energies_do_not_depend_on_the_atoms_before():
@@ -266,14 +266,14 @@ def test_rigid_molecules_are_minimised(waters):
         atoms.calc.minimise(atoms, force_limit_kJ_mol_A=-1)
     with pytest.warns(RigidMDWarning, match="has not converged after 1 iterations"):
         cold = cluster("tip4p", 4)
-        RigidMD("tip4p").minimise(cold, most_iterations=1)
+        RigidMD("tip4p").minimise(cold, max_iterations=1)
     boxed = turned(waters)
     boxed.set_momenta(np.zeros((120, 3)))
     boxed.calc = RigidMD("spce", cutoff_A=4.0, truncation="smooth_switch")
     before = boxed.get_positions()
     volume, distances = boxed.get_volume(), boxed.get_all_distances(mic=True)
     with pytest.warns(RigidMDWarning, match="has not converged"):
-        boxed.calc.minimise(boxed, pressure_bar=1000.0, most_iterations=8)
+        boxed.calc.minimise(boxed, pressure_bar=1000.0, max_iterations=8)
     assert boxed.get_volume() != volume
     moved = boxed.get_all_distances(mic=True)
     assert (
@@ -415,7 +415,7 @@ def test_acetonitrile_is_that_of_ase():
         "molecules": [{"name": "acn", "sites": sites, "count": 4}],
         "box": {"lengths_A": 12.0, "periodic": False},
     }
-    atoms = rigidmd.atoms_of(Scene.from_dict(data | {"stages": [{"ensemble": "minimise"}]}))
+    atoms = rigidmd.to_atoms(Scene.from_dict(data | {"stages": [{"ensemble": "minimise"}]}))
     other = atoms.copy()
     other.calc = acn.ACN(rc=1e4)
     atoms.calc = RigidMD([{"name": "acn", "sites": sites}], atom_forces="sites")
@@ -426,7 +426,7 @@ def test_acetonitrile_is_that_of_ase():
 def test_pme_in_a_triclinic_cell():
     counts = {"spce": 12, "nitrogen": 4, "argon": 3}
     box = {"lengths_A": [11.0, 12.0, 13.0], "angles_deg": [80.0, 100.0, 75.0]}
-    atoms = turned(rigidmd.atoms_of(small_scene(counts, None, box=box, forces={"cutoff_A": 4.5})))
+    atoms = turned(rigidmd.to_atoms(small_scene(counts, None, box=box, forces={"cutoff_A": 4.5})))
     keywords = {
         "cutoff_A": 4.5,
         "electrostatics": "pme",

@@ -270,7 +270,7 @@ def test_a_potential_of_a_module_needs_trust(tmp_path):
     untrusted = Scene.from_dict(data, tmp_path)
     with pytest.raises(SceneError, match="is Python code"):
         build(untrusted)
-    rigidmd.trust(tmp_path / "own.py")
+    rigidmd.trust_file(tmp_path / "own.py")
     assert list(build(Scene.from_dict(data, tmp_path)).terms) == ["own"]
 
 

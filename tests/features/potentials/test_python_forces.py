@@ -23,7 +23,7 @@ class Field(rigidmd.Force):
     """A field along z, on sites."""
 
     changes_momentum = (False, False, False)
-    tied_to_places = False
+    absolute_positions = False
 
     def begin(self, system):
         self.charge = system.of_sites(lambda molecule: molecule.charges)
@@ -153,11 +153,11 @@ class Turned(rigidmd.Force):
 
 
 class Unstretched(Spring):
-    tied_to_places = False
+    absolute_positions = False
 
 
 class Sheared(rigidmd.Force):
-    tied_to_places = False
+    absolute_positions = False
 
     def on_molecules(self, state):
         return 0.0, np.zeros_like(state.position), None, np.diag([500.0, -500.0, 0.0])
@@ -188,7 +188,7 @@ class Halfway(Spring):
         (Turned(), "turned: the torque on molecule"),
         (
             Unstretched(),
-            "spring: the component xx of its molecular virial is 0 kJ/mol.*tied_to_places = True",
+            "spring: the component xx of its molecular virial is 0 kJ/mol.*absolute_positions = True",
         ),
         (Sheared(), "the component xx of its molecular virial is 500"),
         (InPlace(), "read-only"),

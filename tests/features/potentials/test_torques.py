@@ -157,7 +157,7 @@ def test_trial_molecules_without_inertia_are_refused_too(tmp_path):
 class Twist(rigidmd.Force):
     """A torque about one axis of each body that does no work, as nothing rotates about it."""
 
-    tied_to_places = False
+    absolute_positions = False
 
     def __init__(self, axis):
         self.axis = axis

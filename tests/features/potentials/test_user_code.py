@@ -25,7 +25,7 @@ import rigidmd
 
 class Trap(NamedTuple):
     stiffness: float
-    tied_to_places = True
+    absolute_positions = True
 
 @rigidmd.compiled_force(Trap)
 def add(term, state, load, tally):
@@ -90,7 +90,7 @@ def test_a_file_of_code_runs_only_where_it_is_trusted(tmp_path, monkeypatch, cap
 )
 def test_a_file_that_is_useless_is_reported(text, entry, word, tmp_path):
     (tmp_path / "mine.py").write_text(text)
-    rigidmd.trust(tmp_path / "mine.py")
+    rigidmd.trust_file(tmp_path / "mine.py")
     scene = rigidmd.Scene.from_dict(
         POINTS | {"forces": {"custom": [{"module": "mine.py", **entry}]}}, tmp_path
     )

@@ -191,8 +191,8 @@ def test_defaults_are_written_and_resolve_to_themselves():
     scene = small_scene(
         {"spce": 64}, 18.6, forces={"cutoff_A": 8.0, "truncation": "shift", "dispersion": "pme"}
     )
-    resolved = rigidmd.resolve(scene)
-    assert rigidmd.resolve(resolved) == resolved
+    resolved = rigidmd.with_defaults(scene)
+    assert rigidmd.with_defaults(resolved) == resolved
     forces = resolved.forces
     assert (forces.dispersion_accuracy, forces.tail_correction) == (5e-5, False)
     assert None not in (

@@ -441,7 +441,7 @@ from rigidmd.units import KJ_PER_MOL
 class Trap(NamedTuple):
     stiffness: float  # u/ps²
 
-    tied_to_places = True
+    absolute_positions = True
     changes_momentum = np.ones(3, bool)
 
 

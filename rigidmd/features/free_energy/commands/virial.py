@@ -65,12 +65,12 @@ def _temperatures(text: str) -> list[float]:
 )
 def _virial(options: Options) -> int:
     from rigidmd.features.free_energy.virial import second_virial, table_of
-    from rigidmd.features.potentials.user_code.trust import trust
+    from rigidmd.features.potentials.user_code.trust import trust_file
     from rigidmd.io.write import check_target
     from rigidmd.scene import parse_override
 
     for path in options.trust:
-        trust(path)
+        trust_file(path)
     if options.output:
         check_target(Path(options.output), (".csv",), force=options.force)
     settings = dict(parse_override(text) for text in options.overrides)

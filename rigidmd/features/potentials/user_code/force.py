@@ -14,6 +14,7 @@ from rigidmd.errors import SimulationError, describe_error
 from rigidmd.features.potentials.poses.potential import BodyPairPotential
 from rigidmd.features.potentials.python_forces import PythonForces, PythonForcesWorkspace
 from rigidmd.forces.parts import Tail
+from rigidmd.forces.terms import trait
 from rigidmd.scene.molecules import UserForce
 from rigidmd.units import KJ_PER_MOL
 
@@ -55,7 +56,7 @@ class Force(UserForce):
         In logs and messages. Default: the name of the class
     changes_momentum
         Which components of the total momentum it may change. False for forces between molecules
-    tied_to_places
+    absolute_positions
         Whether its energy depends on absolute positions, which excludes a barostat. If False, its
         virial must be the last of the returned values
     energy_noise
@@ -71,7 +72,7 @@ class Force(UserForce):
 
     name: ClassVar[str | None] = None
     changes_momentum: ClassVar[Sequence[bool]] = EVERY
-    tied_to_places: ClassVar[bool] = True
+    absolute_positions: ClassVar[bool] = True
     energy_noise: ClassVar[float] = 0.0
 
     def begin(self, system: System) -> None:
@@ -122,7 +123,9 @@ class BoundForce:
         self._called("begin", system)
         n = len(system.state.velocity)
         turns = len(system.state.rotation) > 0
-        self.term = PythonForces(n, turns, changes_momentum(force), bool(force.tied_to_places))
+        self.term = PythonForces(
+            n, turns, changes_momentum(force), trait(force, "absolute_positions")
+        )
 
     def __call__(self, workspace: PythonForcesWorkspace, state: State) -> None:
         """Fill a workspace with the forces at a state. Raises UserForceError."""

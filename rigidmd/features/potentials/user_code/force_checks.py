@@ -219,6 +219,6 @@ def _check_virial(state: State, virial: np.ndarray, size: float, difference: _Di
                 f" {derivative / KJ_PER_MOL:.8g} kJ/mol, and when box and centres of mass are"
                 f" strained the energy falls by {slope / KJ_PER_MOL:.8g} kJ/mol:"
                 f" {'correct it' if virial.any() else 'add it'}, or, if the energy depends on"
-                " positions in the lab, set tied_to_places = True in its class"
+                " positions in the lab, set absolute_positions = True in its class"
             )
     return ""

@@ -38,9 +38,9 @@ def compiled_force(kind: type) -> Callable[[Function], Function]:
 
     The class may have the attribute `changes_momentum`, three booleans: whether the force may
     change each component of the total momentum (the default), so False for forces between
-    molecules. `tied_to_places = True` means that the energy depends on positions in the lab, which
-    excludes a barostat. The class may hold numbers, arrays and tuples of them. If its numbers come
-    from the system, give `Simulation` an object with a method `term(system)` that makes it.
+    molecules. `absolute_positions = True` means that the energy depends on positions in the lab,
+    which excludes a barostat. The class may hold numbers, arrays and tuples of them. If its numbers
+    come from the system, give `Simulation` an object with a method `term(system)` that makes it.
 
     Examples
     --------

@@ -15,7 +15,7 @@ from rigidmd.scene.validation import in_python
 _TRUSTED: set[str] = set()
 
 
-def trust(path: str | Path) -> None:
+def trust_file(path: str | Path) -> None:
     """Allow scenes to run a Python file with these contents, at any path. The code can do anything
     that you can do: read it before. On the command line, --trust FILE does the same.
 
@@ -53,7 +53,7 @@ def trusted_module(path: Path, key: str) -> ModuleType:
     source = _source(path, key)
     if digest_of(source) not in _TRUSTED:
         why = "is Python code, which can do whatever you can: read it, and if you trust it,"
-        advice = f"call rigidmd.trust({str(path)!r})"
+        advice = f"call rigidmd.trust_file({str(path)!r})"
         if not in_python():
             advice = f"add {option('trust')} {path} (in Python: {advice.removeprefix('call ')})"
         raise SceneError(key, [f"{path} {why} {advice}"])

@@ -41,7 +41,7 @@ from rigidmd.features.studies.sweep.folder import (
     without_seed,
 )
 from rigidmd.io.folder import elsewhere
-from rigidmd.run.kind import resolve
+from rigidmd.run.kind import with_defaults
 from rigidmd.run.resume import (
     NOT_COMPARED,
     describe_differences,
@@ -256,7 +256,7 @@ def read_points(
 
 def _build_error(scene: Scene) -> RigidMDError | None:
     try:
-        resolve(scene)  # pyright: ignore[reportArgumentType]  (either kind)
+        with_defaults(scene)  # pyright: ignore[reportArgumentType]  (either kind)
     except RigidMDError as error:
         return error
     return None

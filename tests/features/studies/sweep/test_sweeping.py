@@ -249,7 +249,7 @@ import rigidmd
 
 class Spring(NamedTuple):
     stiffness: float
-    tied_to_places = True
+    absolute_positions = True
 
 
 @rigidmd.compiled_force(Spring)
