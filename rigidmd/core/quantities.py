@@ -1,7 +1,7 @@
 """The table of quantities of runs: what is sampled, averaged and shown, and how.
 
 A row is all that a quantity takes: the log, `results[...]`, the summary, reports, pages and sweeps
-read this table.
+read this table. A name in Python has no unit. A header is a title with the unit.
 """
 
 from collections.abc import Callable, Mapping
@@ -10,6 +10,7 @@ from functools import partial
 from math import hypot, inf, isfinite, nan
 
 from rigidmd.core.state import HEAT, NOW, WORK
+from rigidmd.core.user_warnings import warn_renamed
 from rigidmd.units import GRAM_PER_CM3
 
 
@@ -46,11 +47,15 @@ class Mean:
     is_main: bool = False
 
 
+#: Units in ASCII, as headers have them.
+IN_ASCII = str.maketrans({"Å": "A", "²": "^2", "³": "^3", "°": "deg"})
+
+
 @dataclass(frozen=True)
 class Quantity:
     """A quantity, one value for each sample.
 
-    header : in the file of samples; empty for one that is not written
+    title : of its column in the file of samples; empty for one that is not written
     unit : "1" for plain numbers, empty for text
     of : its value for an `engines.observables.Observation`. Default: the attribute of its name
     is_averaged : whether its mean has a meaning
@@ -59,10 +64,11 @@ class Quantity:
     mean : where its mean is shown; of one that is not averaged, where its drift is shown
     gradient : its gradient over the gradient of the potential energy; NaN where it is unknown
     kinetic : the motions whose kinetic energy it contains
+    former : its name in the version before
     """
 
     name: str  # in Python
-    header: str
+    title: str
     unit: str
     about: str
     of: Callable[..., float | str] | None = None
@@ -72,6 +78,13 @@ class Quantity:
     mean: Mean | None = None
     gradient: float = nan
     kinetic: tuple[str, ...] = ()
+    former: str = ""
+
+    @property
+    def header(self) -> str:
+        """The header of its column, such as "Box Volume (nm^3)"."""
+        has_unit = self.title and self.unit not in ("", "1")
+        return f"{self.title} ({self.unit.translate(IN_ASCII)})" if has_unit else self.title
 
     @property
     def mean_header(self) -> str:
@@ -82,6 +95,16 @@ class Quantity:
         return self.of(observation) if self.of else getattr(observation, self.name)
 
 
+def current_name(name: str, described: Mapping[str, Quantity]) -> str:
+    """The name of a quantity by this name, or by that of the version before."""
+    if name not in described:
+        for row in described.values():
+            if row.former and row.former == name:
+                warn_renamed(name, row.name)
+                return row.name
+    return name
+
+
 #: Motions of molecules, each with a kinetic energy and degrees of freedom.
 MOTIONS = ("translation", "rotation")
 
@@ -90,7 +113,7 @@ def energy_of_force(name: str) -> Quantity:
     """The energy of a user-defined force."""
     return Quantity(
         name,
-        f"{name} (kJ/mole)",
+        name,
         "kJ/mol",
         f"energy of the force {name}",
         lambda o: o.energies[name] / o.energy_unit,
@@ -100,14 +123,14 @@ def energy_of_force(name: str) -> Quantity:
 def restrained_distance(k: object, of: Callable[..., float] | None = None) -> Quantity:
     """The distance that fields.restraints.k restrains."""
     about = f"distance of the groups of fields.restraints.{k}"
-    return Quantity(f"distance_{k}", f"Distance {k} (A)", "Å", about, of)
+    return Quantity(f"distance_{k}", f"Distance {k}", "Å", about, of)
 
 
 def _edge(name: str, k: int) -> Quantity:
     about = f"length of the box's edge {name}"
     return Quantity(
         name,
-        f"{name} (A)",
+        name,
         "Å",
         about,
         lambda o: o.edges[k],
@@ -119,17 +142,17 @@ def _edge(name: str, k: int) -> Quantity:
 
 def _angle(name: str, between: str, k: int) -> Quantity:
     about = f"angle between {between}"
-    return Quantity(name, f"{name} (deg)", "°", about, lambda o: o.edges[k], of_box=True)
+    return Quantity(name, name, "°", about, lambda o: o.edges[k], of_box=True)
 
 
 def _pressure(axes: str, about: str) -> Quantity:
     i, j = map("xyz".index, axes)
     return Quantity(
         f"pressure_{axes}",
-        f"Pressure {axes} (bar)",
+        f"Pressure {axes}",
         "bar",
         about,
-        lambda o: float(o.pressure_tensor_bar[i, j]),
+        lambda o: float(o.pressure_tensor[i, j]),
         of_tensor=True,
     )
 
@@ -164,10 +187,10 @@ QUANTITIES = {
             "steps since the start",
             lambda o: int(o.state.step[NOW]),
         ),
-        _unaveraged("time", "Time (ps)", "ps", "time since the start"),
+        _unaveraged("time", "Time", "ps", "time since the start"),
         Quantity(
             "potential",
-            "Potential Energy (kJ/mole)",
+            "Potential Energy",
             "kJ/mol",
             "potential energy of the whole system",
             mean=Mean(
@@ -177,7 +200,7 @@ QUANTITIES = {
                 short="potential energy",
                 order=3,
                 per_molecule=True,
-                header="Potential Energy per molecule (kJ/mole)",
+                header="Potential Energy per molecule (kJ/mol)",
                 brief="U per molecule (kJ/mol)",
                 is_main=True,
             ),
@@ -185,21 +208,21 @@ QUANTITIES = {
         ),
         Quantity(
             "kinetic",
-            "Kinetic Energy (kJ/mole)",
+            "Kinetic Energy",
             "kJ/mol",
             "kinetic energy, translation and rotation",
             kinetic=MOTIONS,
         ),
         Quantity(
             "energy",
-            "Total Energy (kJ/mole)",
+            "Total Energy",
             "kJ/mol",
             "potential and kinetic energy",
             kinetic=MOTIONS,
         ),
         Quantity(
             "temperature",
-            "Temperature (K)",
+            "Temperature",
             "K",
             "temperature of all motion",
             mean=Mean(
@@ -215,7 +238,7 @@ QUANTITIES = {
         ),
         Quantity(
             "volume",
-            "Box Volume (nm^3)",
+            "Box Volume",
             "nm³",
             "volume of the box",
             _volume,
@@ -224,18 +247,25 @@ QUANTITIES = {
         ),
         Quantity(
             "density",
-            "Density (g/mL)",
+            "Density",
             "g/cm³",
             "mass density",
             _density,
             of_box=True,
-            mean=Mean("density{}_g_cm3", "density", digits=4, order=5, is_main=True),
+            mean=Mean(
+                "density{}_g_cm3",
+                "density",
+                digits=4,
+                order=5,
+                brief="Density (g/cm³)",
+                is_main=True,
+            ),
             gradient=0.0,
         ),
         _unaveraged("stage_name", "Stage", "", "name of the stage"),
         Quantity(
             "temperature_translation",
-            "T_trans (K)",
+            "T_trans",
             "K",
             "temperature of translation",
             mean=Mean(
@@ -251,7 +281,7 @@ QUANTITIES = {
         ),
         Quantity(
             "temperature_rotation",
-            "T_rot (K)",
+            "T_rot",
             "K",
             "temperature of rotation",
             mean=Mean(
@@ -266,8 +296,8 @@ QUANTITIES = {
             kinetic=MOTIONS[1:],
         ),
         Quantity(
-            "pressure_bar",
-            "Pressure (bar)",
+            "pressure",
+            "Pressure",
             "bar",
             "molecular pressure, with the tail correction and kB T/V of a total momentum that is"
             " kept at zero",
@@ -280,10 +310,11 @@ QUANTITIES = {
                 is_main=True,
             ),
             kinetic=MOTIONS[:1],
+            former="pressure_bar",
         ),
         _unaveraged(
             "drift",
-            "Drift (kJ/mole)",
+            "Drift",
             "kJ/mol",
             "change of `conserved` since the stage began",
             lambda o: o.conserved - (o.conserved if o.origin is None else o.origin),
@@ -299,7 +330,7 @@ QUANTITIES = {
         ),
         _unaveraged(
             "momentum",
-            "Momentum (u A/ps)",
+            "Momentum",
             "u Å/ps",
             "size of the total momentum",
             lambda o: hypot(*o.sums.momentum.tolist()),
@@ -319,14 +350,14 @@ QUANTITIES = {
         _angle("gamma", "a and b", 5),
         _unaveraged(
             "heat",
-            "Heat (kJ/mole)",
+            "Heat",
             "kJ/mol",
             "heat that thermostats have added since the start",
             lambda o: float(o.ledger[HEAT]),
         ),
         _unaveraged(
             "work",
-            "Work (kJ/mole)",
+            "Work",
             "kJ/mol",
             "work of barostats, drives and minimisations so far",
             lambda o: float(o.ledger[WORK]),
@@ -342,21 +373,21 @@ QUANTITIES = {
         _unaveraged("stage", "", "1", "index of the stage, from 0"),
         _unaveraged(
             "force_squares",
-            "F^2/m (kJ/mole/ps^2)",
+            "F^2/m",
             "kJ/mol/ps²",
             "sum of F²/m of all molecules",
             _sum("force"),
         ),
         _unaveraged(
             "torque_squares",
-            "n^2/I (kJ/mole/ps^2)",
+            "n^2/I",
             "kJ/mol/ps²",
             "the same of torques n",
             _sum("torque"),
         ),
         _unaveraged(
             "curvature",
-            "v U'' v (kJ/mole/ps^2)",
+            "v U'' v",
             "kJ/mol/ps²",
             "second derivative of the potential energy along free flight and free rotation, in the"
             " middle of the step before",

@@ -9,6 +9,7 @@ import numpy as np
 
 from rigidmd.core.quantities import QUANTITIES
 from rigidmd.core.state import NOW, Load, State, edges_and_angles
+from rigidmd.core.user_warnings import warn_renamed
 from rigidmd.dynamics.observables import StateSums, sums_of_state
 from rigidmd.engines.protocol import Engine
 from rigidmd.engines.samples import Sample
@@ -50,13 +51,16 @@ class Observation:
     temperature_translation: float
     temperature_rotation: float
     virial: np.ndarray  # (3, 3) molecular, without the tail correction; an energy
-    pressure_bar: float
-    #: (3, 3) molecular, tail correction included, symmetric; NaN without a box
-    pressure_tensor_bar: np.ndarray
+    pressure: float  # bar
+    #: (3, 3) molecular, tail correction included, symmetric, bar; NaN without a box
+    pressure_tensor: np.ndarray
     edges: list[float]  # of the box, and its angles
     sample: Sample = field(default_factory=Sample, init=False)
 
     def __getattr__(self, column: str) -> float:
+        if column == "pressure_tensor_bar":
+            warn_renamed(column, "pressure_tensor")
+            return self.pressure_tensor
         return getattr(self.sample, column)
 
     def __dir__(self) -> list[str]:
@@ -181,8 +185,8 @@ def observe(
         temperature_translation=of_translation,
         temperature_rotation=_temperature(rotation_corrected, freedom.rotation),
         virial=virial / energy_unit,
-        pressure_bar=float(pressure.trace()) / (3 * BAR),
-        pressure_tensor_bar=pressure / BAR,
+        pressure=float(pressure.trace()) / (3 * BAR),
+        pressure_tensor=pressure / BAR,
         edges=edges,
     )
     # those of pilot runs are in no log

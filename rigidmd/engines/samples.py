@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigidmd.core.quantities import QUANTITIES, Quantity
+from rigidmd.core.quantities import QUANTITIES, Quantity, current_name
 from rigidmd.core.statistics import least_error_from, may_be_unsteady, steady_from
 
 if TYPE_CHECKING:
@@ -19,6 +19,12 @@ if TYPE_CHECKING:
 class Sample(SimpleNamespace):
     """One line of the log, by the names of its columns, in their units. NaN for what does not
     exist: pressure without a box, T_rot of points."""
+
+    def __getattr__(self, name: str) -> float:
+        current = current_name(name, QUANTITIES)
+        if current == name:
+            raise AttributeError(f"a sample has no {name!r}")
+        return getattr(self, current)
 
 
 #: Key of `results[...]` for rotation matrices (n, 3, 3), where something has one: no column of a
@@ -40,6 +46,7 @@ class SampleTable(ABC):
     def __getitem__(self, column: str) -> np.ndarray:
         """A column as an array, one value for each sample, in its unit in the file. Raises KeyError
         with all names."""
+        column = current_name(column, self.described)
         if column not in self.described:
             raise KeyError(f"no column {column!r}; there are {', '.join(self.described)}")
         return self._array(column)

@@ -141,7 +141,13 @@ def read_columns(path: Path) -> Columns | None:
             lines = [line for line in rows if len(line) == len(head)]
     except (UnicodeDecodeError, csv.Error) as error:
         raise OutputError(f"{path} cannot be read: {error}") from None
-    return Columns(path, {header: [line[k] for line in lines] for k, header in enumerate(head)})
+    headers = map(_current_header, head)
+    return Columns(path, {header: [line[k] for line in lines] for k, header in enumerate(headers)})
+
+
+def _current_header(header: str) -> str:
+    """A header as it is now. Earlier versions wrote energies and densities as OpenMM does."""
+    return header.replace("(kJ/mole", "(kJ/mol").replace("(g/mL)", "(g/cm^3)")
 
 
 def _lines(file: TextIO) -> Iterator[str]:

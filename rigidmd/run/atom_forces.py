@@ -188,9 +188,7 @@ def ase_results(
         force = gradient_forces(system, state, load.force, torque, atoms)
     results = {"energy": observation.potential, "forces": force / EV}
     if np.isfinite(state.cell).all():
-        results["stress"] = full_3x3_to_voigt_6_stress(-observation.pressure_tensor_bar) * (
-            BAR / EV
-        )
+        results["stress"] = full_3x3_to_voigt_6_stress(-observation.pressure_tensor) * (BAR / EV)
     return results
 
 

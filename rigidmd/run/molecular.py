@@ -641,9 +641,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             "kinetic": observation.kinetic / size,
             "virial": float(observation.virial.trace()) / size,
             "virial_tensor": (observation.virial / size).tolist(),
-            "pressure_bar": None
-            if np.isnan(observation.pressure_bar)
-            else observation.pressure_bar,
+            "pressure_bar": None if np.isnan(observation.pressure) else observation.pressure,
             "largest_force_per_A": float(forces.max()) / size,
             "largest_force_molecule": int(forces.argmax()) + 1,
             "meaning": meaning,

@@ -19,7 +19,7 @@ def read_log(folder: Path, system: System) -> dict[str, np.ndarray]:
     if read is None:
         raise OutputError(f"{folder / LOG} cannot be read: there is no such file")
     known = {header: name for name, header in columns(system.quantities).items()}
-    unit = energy_of_force("").header
+    unit = energy_of_force("E").header.removeprefix("E")
     headers = {
         known.get(header) or header.removesuffix(unit): header
         for header in read.cells

@@ -90,6 +90,8 @@ class Scene(Section, Displayed):
     time_unit: ClassVar[str] = "ps"
     """Unit of the times of a run, "ps" or "s\""""
 
+    _internal: ClassVar[tuple[str, ...]] = ("SIZES", "contradictions", "rows", "schemes", "subject")
+
     name: Annotated[str, Field(pattern=r"^[\w][\w.\-]*$", max_length=LONGEST_NAME)] = "scene"
     """Name of the run. Default: the name of the file"""
 

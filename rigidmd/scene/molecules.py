@@ -198,6 +198,15 @@ class MatterKeys(Scene):
 class MolecularScene(CouplingKeys, MatterKeys):
     """A scene of moving molecules."""
 
+    _internal: ClassVar[tuple[str, ...]] = (
+        *Scene._internal,
+        "errors_of_steps",
+        "first_moving",
+        "rounded_times",
+        "structure_source",
+        "user_code",
+        "with_user_code",
+    )
     kind: ClassVar[str] = "molecules"
     subject: ClassVar[str] = "molecules"
     SIZES: ClassVar[tuple[float, float]] = SIZES

@@ -9,7 +9,7 @@ from functools import cache, reduce
 from itertools import pairwise
 from math import copysign, isfinite
 from operator import getitem
-from typing import Annotated, Literal, TypeVar, overload
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, TypeVar, overload
 
 from pydantic import (
     BaseModel,
@@ -62,8 +62,30 @@ def _add_docstrings(schema: Json, kind: type[BaseModel]) -> None:
                 described.setdefault("description", inspect.cleandoc(ast.literal_eval(text.value)))
 
 
-class Section(BaseModel):
+if TYPE_CHECKING:
+    from pydantic._internal._model_construction import ModelMetaclass
+else:
+    ModelMetaclass = type(BaseModel)
+OBJECT = {*dir(object)}
+#: Names of pydantic, which are of no use to users.
+OF_PYDANTIC = {*dir(BaseModel)} - OBJECT | {*vars(BaseModel)}
+
+
+class SectionKind(ModelMetaclass):
+    """The class of sections, whose `dir` and `help` are short."""
+
+    def __dir__(cls) -> list[str]:
+        return _without_internals(cls, super().__dir__())
+
+
+class Section(BaseModel, metaclass=SectionKind):
     """A frozen table of a TOML file. Unknown keys are errors."""
+
+    _internal: ClassVar[tuple[str, ...]] = ()
+    """Names that packages use and users do not"""
+
+    def __dir__(self) -> list[str]:
+        return _without_internals(type(self), super().__dir__())
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", defer_build=True, json_schema_extra=_add_docstrings
@@ -78,6 +100,12 @@ class Section(BaseModel):
     def _errors(self) -> Iterable[str]:
         """Messages on keys of this table that contradict each other."""
         return ()
+
+
+def _without_internals(kind: type[Section], names: Iterable[str]) -> list[str]:
+    """The names of a section without those that users do not need."""
+    hidden = OF_PYDANTIC.union(kind._internal)
+    return [name for name in names if name not in hidden and (name[:2] != "__" or name in OBJECT)]
 
 
 #: A name or a path, without line ends and other control characters.

@@ -19,7 +19,7 @@ def test_one_row_adds_a_quantity_everywhere(tmp_path, monkeypatch):
     """In the log, results, observations, summary, both reports, the page and the table of a sweep."""
     row = Quantity(
         "translation",
-        "Translation (kJ/mole)",
+        "Translation",
         "kJ/mol",
         "kinetic energy of translation",
         lambda observation: observation.kinetic_translation,
@@ -37,7 +37,7 @@ def test_one_row_adds_a_quantity_everywhere(tmp_path, monkeypatch):
     assert simulation.observation.translation == results["translation"][-1]
     with (folder / "log.csv").open() as file:
         lines = list(csv.DictReader(file))
-    assert [float(line["Translation (kJ/mole)"]) for line in lines] == results["kinetic"].tolist()
+    assert [float(line["Translation (kJ/mol)"]) for line in lines] == results["kinetic"].tolist()
     (stage,) = json.loads((folder / "summary.json").read_text())["stages"]
     assert stage["translation_kJ_mol"] == pytest.approx(results["kinetic"].mean())
     assert stage["translation_error_kJ_mol"] > 0

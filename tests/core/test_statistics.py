@@ -192,7 +192,7 @@ def test_means_of_windows_of_a_run_have_honest_errors():
         output={"trajectory": False, "log_interval_ps": 0.1},
     )
     results = Simulation(scene).run()
-    for name in ("potential", "temperature", "pressure_bar"):
+    for name in ("potential", "temperature", "pressure"):
         values = results[name][results["stage"] == 1]
         found, known = pulls(values[: len(values) // 100 * 100].reshape(-1, 100) - values.mean())
         assert known > 0.9

@@ -71,6 +71,27 @@ def test_a_force_with_the_former_attribute_keeps_its_meaning(depends):
     assert system.position_dependent == ["Spring"] * depends
 
 
+def test_columns_have_their_former_names_for_one_version(tmp_path):
+    simulation = Simulation(scene(stages=STAGES[1:]), tmp_path / "run")
+    results = simulation.run()
+    observation = simulation.observation
+    with pytest.warns(DeprecationWarning, match="pressure_bar is pressure now"):
+        assert (results["pressure_bar"] == results["pressure"]).all()
+    with pytest.warns(DeprecationWarning, match="pressure_bar is pressure now"):
+        assert observation.pressure_bar == observation.pressure
+    with pytest.warns(DeprecationWarning, match="pressure_tensor_bar is pressure_tensor now"):
+        assert (observation.pressure_tensor_bar == observation.pressure_tensor).all()
+    with pytest.warns(DeprecationWarning, match="pressure_bar is pressure now"):
+        assert rigidmd.view.plot(results, "pressure_bar")
+    log = tmp_path / "run" / "log.csv"
+    text = log.read_text()
+    assert '"Total Energy (kJ/mol)"' in text and '"Density (g/cm^3)"' in text
+    log.write_text(text.replace("(kJ/mol", "(kJ/mole").replace("g/cm^3", "g/mL"))
+    read = rigidmd.read_run(tmp_path / "run")  # a log of an earlier version
+    for name in ("energy", "drift", "density", "torque_squares"):
+        assert (read[name] == results[name]).all()
+
+
 def test_new_names_warn_of_nothing():
     Simulation(scene(stages=[{"ensemble": "minimise", "max_iterations": 3}]))
     assert Scene.read("systems/water.toml")

@@ -422,7 +422,7 @@ def test_the_log_has_the_box_and_the_energy_ledger(tmp_path):
     results = Simulation(scene, tmp_path / "out").run()
     assert "Pressure xy (bar)" in (tmp_path / "out" / "log.csv").read_text().splitlines()[0]
     trace = sum(results[f"pressure_{k}{k}"] for k in "xyz")
-    assert trace / 3 == pytest.approx(results["pressure_bar"], rel=1e-9)
+    assert trace / 3 == pytest.approx(results["pressure"], rel=1e-9)
     assert results["volume"][-1] == pytest.approx(results.state.volume * 1e-3)
     assert results["gamma"][-1] != 90 and results["work"][-1] != 0
     frames = (

@@ -106,7 +106,7 @@ def test_a_piston_keeps_the_mean_pressure():
     course = follow(
         dumbbells(50, forces, warm, nph | {"duration_ps": 10.0}, nph | {"duration_ps": 300.0}), 0.05
     )
-    pressure = course["pressure_bar"]
+    pressure = course["pressure"]
     # The piston's swings cancel over whole periods, which a statistical inefficiency of at least 1
     # does not see: means over ten periods each.
     means = pressure[len(pressure) % 100 :].reshape(-1, 100).mean(axis=1)

@@ -254,8 +254,8 @@ def test_what_a_document_describes_can_be_done(
         tables = scene.get("forces", {})
         names = [entry["name"] for entry in tables.get("custom", ())]
         names += [entry.get("name", entry.get("potential")) for entry in tables.get("bodies", ())]
-        own = {f"{name} (kJ/mole)" for name in names}
-        header = ["NAME (kJ/mole)" if column in own else column for column in header]
+        own = {f"{name} (kJ/mol)" for name in names}
+        header = ["NAME (kJ/mol)" if column in own else column for column in header]
         assert {_first_of_its_kind(column) for column in header} <= named
 
 

@@ -201,7 +201,7 @@ def test_fcc_argon_has_its_lattice_constant_at_no_pressure():
     assert found["converged"]
     assert found["largest_pressure_deviation_bar"] <= 1e-3
     assert results.summary["stages"][0]["a_A"] / n == pytest.approx(exact, rel=1e-6)
-    assert results["pressure_bar"][-1] == pytest.approx(0.0, abs=2e-3)  # at rest: no stage moves
+    assert results["pressure"][-1] == pytest.approx(0.0, abs=2e-3)  # at rest: no stage moves
     assert results["temperature"][-1] == 0
 
 

@@ -232,16 +232,16 @@ def test_a_scene_through_the_command_line(tmp_path, printed):
         rows = list(csv.DictReader(file))
     assert [row["Stage"] for row in rows] == ["minimise", "minimise", "cell", "nvt", "nvt"]
     assert [float(row["Time (ps)"]) for row in rows] == pytest.approx([0, 0, 0, 0.01, 0.02])
-    assert [row["Drift (kJ/mole)"] for row in rows[:3]] == ["", "", ""]
+    assert [row["Drift (kJ/mol)"] for row in rows[:3]] == ["", "", ""]
     assert [float(row["Temperature (K)"]) for row in rows[:3]] == pytest.approx([300, 300, 300])
-    energies = [float(row["Potential Energy (kJ/mole)"]) for row in rows]
+    energies = [float(row["Potential Energy (kJ/mol)"]) for row in rows]
     assert energies[0] > energies[1] > energies[2]
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     kept, cell, nvt = summary["stages"]
     assert kept["minimum"]["converged"]
     assert kept["minimum"]["largest_pressure_deviation_bar"] is None
     assert cell["minimum"]["largest_pressure_deviation_bar"] <= 1
-    assert cell["density_g_cm3"] == pytest.approx(float(rows[2]["Density (g/mL)"]))
+    assert cell["density_g_cm3"] == pytest.approx(float(rows[2]["Density (g/cm^3)"]))
     assert cell["density_g_cm3"] != pytest.approx(0.9, rel=1e-3)
     assert 40 * kept["minimum"]["energy_after_kJ_mol_per_molecule"] == pytest.approx(energies[1])
     assert nvt["steps"] == 8  # of 2.5 fs, the default that divides the intervals

@@ -29,7 +29,7 @@ def test_a_mean_is_the_mean_of_the_summary():
     assert found == Estimate(value, pytest.approx(error), "kJ/mol per molecule")
     assert results.mean("potential") == found
     assert str(found).endswith("kJ/mol per molecule")
-    assert results.mean("pressure_bar").value == stage["pressure_bar"]
+    assert results.mean("pressure").value == stage["pressure_bar"]
     bias = stage["potential_step_kJ_mol_per_molecule"]
     at_zero = results.mean("potential_energy", zero_step=True)
     assert at_zero.value == pytest.approx(value - bias)

@@ -190,7 +190,7 @@ def test_compare_reports_where_two_runs_diverge(again, stopped, tmp_path, capsys
     assert "position by up to" in said and "over their common samples" in said
     log = other / "log.csv"
     lines = [line.split(",") for line in log.read_text().splitlines()]
-    column = lines[0].index('"Kinetic Energy (kJ/mole)"')
+    column = lines[0].index('"Kinetic Energy (kJ/mol)"')
     lines[3][column] = repr(float(np.nextafter(float(lines[3][column]), np.inf)))
     log.write_text("\n".join(",".join(line) for line in lines) + "\n")
     scene = other / "scene.toml"
@@ -199,7 +199,7 @@ def test_compare_reports_where_two_runs_diverge(again, stopped, tmp_path, capsys
     assert "seed: 1 and 5" in said
     assert "the runs diverge at Step 20, sample 3 of 7" in said and "last 1 of 53 bits" in said
     told = json.loads(printed("compare", one, other, "--json", code=1).out)
-    assert [cell["column"] for cell in told["samples"]["first"]] == ["Kinetic Energy (kJ/mole)"]
+    assert [cell["column"] for cell in told["samples"]["first"]] == ["Kinetic Energy (kJ/mol)"]
     assert "is not the folder of a run" in printed("compare", one, tmp_path, code=2).err
 
 

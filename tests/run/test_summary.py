@@ -34,8 +34,8 @@ def test_log_and_summary(tmp_path):
         [0, 0.01, 0.02, 0.03, 0.04, 0.05]
     )
     for row, sample in zip(rows, results.samples.rows, strict=True):
-        total = float(row["Potential Energy (kJ/mole)"]) + float(row["Kinetic Energy (kJ/mole)"])
-        assert float(row["Total Energy (kJ/mole)"]) == pytest.approx(total)
+        total = float(row["Potential Energy (kJ/mol)"]) + float(row["Kinetic Energy (kJ/mol)"])
+        assert float(row["Total Energy (kJ/mol)"]) == pytest.approx(total)
         assert float(row["Temperature (K)"]) == pytest.approx(sample.temperature)
         assert float(row["Box Volume (nm^3)"]) == pytest.approx(1.85**3)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())

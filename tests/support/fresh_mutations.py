@@ -307,8 +307,8 @@ FRESH: list[Mutation] = [
         "F34",
         "log: shear pressures replaced by those along an axis",
         "core/quantities.py",
-        "o.pressure_tensor_bar[i, j]",
-        "o.pressure_tensor_bar[j, j]",
+        "o.pressure_tensor[i, j]",
+        "o.pressure_tensor[j, j]",
         ("run/test_results.py::test_observers_see_the_units_of_the_log",),
     ),
     Mutation(

@@ -75,17 +75,7 @@ FAMILIES = {
 }
 
 
-def _with_unit(name: str, unit: str) -> str:
-    """The header of a column of motion.csv, such as "phi (rad)". In ASCII, as the headers of
-    log.csv."""
-    return name if unit == "1" else f"{name} ({unit.replace('²', '^2')})"
-
-
-COLUMNS = {
-    n: Quantity(n, _with_unit(n, f.unit), f.unit, f.about)
-    for f in FAMILIES.values()
-    for n in f.names
-}
+COLUMNS = {n: Quantity(n, n, f.unit, f.about) for f in FAMILIES.values() for n in f.names}
 #: Header of a column of motion.csv -> its name, also without units, as earlier versions wrote them.
 NAMES = {name: name for name in COLUMNS} | {"t": "time"} | {c.header: n for n, c in COLUMNS.items()}
 

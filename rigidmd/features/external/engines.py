@@ -284,7 +284,7 @@ def compare_at(system: System, state: State, engine: Engine, other: Engine) -> l
             )
             values = (x / KJ_PER_MOL for x in (*rms, plain * scale + tolerance))
             lines.append(Comparison(f"rms {name} on a molecule", unit, *values))
-    if np.isfinite(ours.pressure_bar) and np.isfinite(theirs.pressure_bar):
+    if np.isfinite(ours.pressure) and np.isfinite(theirs.pressure):
         a, b = (float(observation.virial.trace()) for observation in (ours, theirs))
         lines.append(
             _energy(

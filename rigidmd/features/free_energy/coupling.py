@@ -77,8 +77,8 @@ def energy_to_lambda(
 ) -> Quantity:
     """The energy at one of coupling.lambdas."""
     about = f"potential energy at lambda = {value:g} less the present one, of the same state"
-    header = f"Energy to lambda {value:g} (kJ/mole)"
-    return Quantity(f"energy_to_lambda_{value:g}", header, "kJ/mol", about, change)
+    title = f"Energy to lambda {value:g}"
+    return Quantity(f"energy_to_lambda_{value:g}", title, "kJ/mol", about, change)
 
 
 def _change(value: float, at: Interactions, observation: Observation) -> float:

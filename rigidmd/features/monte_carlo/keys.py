@@ -54,12 +54,13 @@ class HybridMonteCarlo(Thermostat):
             mean=Mean("acceptance{}_mean"),
         ),
         Quantity(
-            "abs_dH_kT",
-            "abs(dH) (kT)",
+            "abs_dH",
+            "abs(dH)",
             "kT",
             f"mean size of the change of the energy in {SINCE}",
             partial(_per_trajectory, SIZES),
             mean=Mean("abs_dH_kT{}_mean"),
+            former="abs_dH_kT",
         ),
         Quantity(
             "exp_minus_dH",

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.core.quantities import Quantity
+from rigidmd.core.quantities import Quantity, current_name
 from rigidmd.core.toml import Json
 from rigidmd.engines.samples import MATRIX, SampleTable
 from rigidmd.engines.sites import AnySystem
@@ -77,22 +77,25 @@ def plot(results: Results, *columns: str, log: bool = False) -> Picture:
     wanted = columns or tuple(figures)[:1]
     if len(wanted) == 1 and wanted[0] in figures:
         return figures[wanted[0]]
-    check_names(columns, results.samples.described, figures)
+    columns = check_names(columns, results.samples.described, figures)
     record = record_of(results.system, results.samples, results.summary, list(columns))
     return columns_figure(record, columns, results.samples.described, log=log)
 
 
 def check_names(
     names: Sequence[str], described: Mapping[str, Quantity], figures: Iterable[str] = ()
-) -> None:
-    """Raise KeyError, with a suggestion, for a name that is not a column of numbers."""
+) -> tuple[str, ...]:
+    """The current names of columns of numbers. Raises KeyError, with a suggestion, for any other
+    name."""
     known = [name for name, column in described.items() if column.unit and name != MATRIX]
+    names = tuple(current_name(name, described) for name in names)
     for name in (name for name in names if name not in known):
         if name in described:
             kind = "matrices" if name == MATRIX else "text"
             raise KeyError(f"column {name!r} has {kind}, which are not plotted")
         others = f"; there are {', '.join([*known, *figures])}"
         raise KeyError(f"no column {name!r}{did_you_mean(name, [*known, *figures]) or others}")
+    return names
 
 
 def columns_figure(
@@ -149,7 +152,7 @@ class LivePlot(Observer):
         self._run, self._due = run, 0.0
         described, every = display_of(run.scene).live_samples(run)
         self.interval = every if self._asked is None else self._asked
-        check_names(self._columns, described)
+        self._columns = check_names(self._columns, described)
         self._spot = DisplayArea() if in_notebook() else None
 
     def observe(self, moment: Moment) -> None:

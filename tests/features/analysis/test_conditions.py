@@ -32,9 +32,7 @@ def made_up(stages=(NVT,), molecules=None, edge=EDGE, frames=FRAMES, **sections)
     moving = system.model.inverse_mass[system.model.species] > 0
     shape = (frames, len(moving))
     rotates = len(system.state.rotation) > 0
-    samples = {
-        name: 300 + 9 * rng.standard_normal(frames) for name in ("temperature", "pressure_bar")
-    }
+    samples = {name: 300 + 9 * rng.standard_normal(frames) for name in ("temperature", "pressure")}
     samples["temperature_translation"] = samples["temperature"]
     samples |= {"time": time, "potential": -400 + 5 * rng.standard_normal(frames)}
     samples |= {"volume": system.state.volume / 1e3 * (1 + 0.01 * rng.standard_normal(frames))}

@@ -52,7 +52,7 @@ def made_up(ensemble, potential, volume=None, virial=None, interval=0.1, counts=
         "temperature_translation": of_translation,
         "potential": np.asarray(potential, float),
         "volume": np.full(len(time), 1e-3 * EDGE**3) if volume is None else volume,
-        "pressure_bar": kinetic + (0.0 if virial is None else virial),
+        "pressure": kinetic + (0.0 if virial is None else virial),
     }
     return replace(history(system, time, None, np.eye(3) * EDGE), columns=columns)
 

@@ -103,7 +103,7 @@ def test_frames_of_a_run(results):
     # the log's pressure contains the total momentum, which is zero
     ideal *= len(model.species) / (len(model.species) - 1)
     pressure = (ideal / EV - atoms.get_stress()[:3].mean()) / units.bar
-    assert pressure == pytest.approx(results["pressure_bar"][-1], rel=1e-7)
+    assert pressure == pytest.approx(results["pressure"][-1], rel=1e-7)
     with pytest.raises(IndexError, match="frame 4 is out of range: this run has 4"):
         results.atoms(4)
     for wrong in (1.5, "first", "1:2:3:4", "::0", ""):

@@ -386,7 +386,7 @@ def test_means_are_those_of_rigidmd(ensemble):
             "potential",
             "temperature_translation",
             "temperature_rotation",
-            "pressure_bar",
+            "pressure",
             "density",
         )
         found[engine] = {name: mean(list(samples[name][late])) for name in names}

@@ -45,7 +45,7 @@ def test_the_weights_of_every_integrator_have_the_mean_one(name):
     }
     results, _ = sampled(stage, {"nitrogen_trappe": 12, "argon": 4}, 13.0, 6 * step / 1000)
     weights = results["exp_minus_dH"][40:]
-    size = results["abs_dH_kT"][40:].mean()
+    size = results["abs_dH"][40:].mean()
     assert 1e-5 < size < 5, size  # neither exact, which proves nothing, nor rejected
     assert abs(weights.mean() - 1) < 4.5 * mean_and_error(weights)[1]
 
@@ -201,7 +201,7 @@ def test_a_trajectory_that_diverges_is_rejected(name):
     start._start()
     assert np.array_equal(results.state.position, start.state.position)
     assert results["acceptance"][1:].tolist() == [0.0] * 4
-    assert np.isfinite(results["abs_dH_kT"][1:]).all()
+    assert np.isfinite(results["abs_dH"][1:]).all()
     assert np.abs(results["drift"]).max() < 1e-9 * np.abs(results["energy"]).max()
     assert any(
         "0.0% of the trajectories were accepted" in note for note in results.summary["notes"]

@@ -156,7 +156,7 @@ def test_adding_a_pair_potential_takes_one_file(tmp_path):
     assert found["same_bits"]
     assert "soft repulsion: strength_kJ_mol = 3.0, range_A = 5.0" in found["check"]
     assert "\n  Lennard-Jones: lennard_jones is false\n" in found["check"]
-    assert found["column"] == "soft_repulsion (kJ/mole)"
+    assert found["column"] == "soft_repulsion (kJ/mol)"
     assert found["file"].endswith("rigidmd/__init__.py") and str(tmp_path) in found["file"]
     assert "soft_repulsion" not in found["without"]
     assert found["schema"] == ["strength_kJ_mol", "range_A"]

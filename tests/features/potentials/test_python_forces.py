@@ -59,7 +59,7 @@ def test_a_force_in_python_conserves_energy_and_is_in_the_log(tmp_path):
     assert abs(results["drift"]).max() < 1e-4 * results["kinetic"][0]
     assert results.system.freedom.translation == 300  # the momentum is not conserved
     header = (tmp_path / "run" / "log.csv").read_text().splitlines()[0]
-    assert header.endswith('"spring (kJ/mole)"')
+    assert header.endswith('"spring (kJ/mol)"')
     assert results.units["spring"] == "kJ/mol"
     assert results.summary["user_forces"] == {"spring": "Spring, computed by Python"}
 

@@ -203,9 +203,9 @@ def test_a_pressure_at_zero_has_the_exact_kinetic_part():
     at = Conditions(
         STEP, TEMPERATURE, 0.0, moving, moving, freedom, *SCHEMES["baoab"], has_barostat=True
     )
-    columns = {"pressure_bar": pressure, "volume": volume}
-    rest = pressure - kinetic_part(QUANTITIES["pressure_bar"], Production(at, series, columns))
+    columns = {"pressure": pressure, "volume": volume}
+    rest = pressure - kinetic_part(QUANTITIES["pressure"], Production(at, series, columns))
     assert rest == pytest.approx(exact + virial, rel=1e-9)
-    found = biases_of(Production(at, series, columns), QUANTITIES)["pressure_bar"]
+    found = biases_of(Production(at, series, columns), QUANTITIES)["pressure"]
     assert found[2] < 0.3 * found[1]
     assert pressure.mean() - found[0] == pytest.approx((exact + virial).mean(), abs=4 * found[2])

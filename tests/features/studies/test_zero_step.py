@@ -161,7 +161,7 @@ def test_corrected_means_of_repeated_runs_agree(model, count, forces, lengths, s
                 "output": {"trajectory": False, "log_interval_ps": 0.05, "figures": False},
             }
             results = Simulation(rigidmd.Scene.from_dict(scene)).run(progress=False)
-            for name in ("potential_energy", "pressure_bar"):
+            for name in ("potential_energy", "pressure"):
                 pair = results.mean(name), results.mean(name, zero_step=True)
                 found.setdefault((name, step), []).append([*pair[0][:2], *pair[1][:2]])
     for (name, step), values in found.items():

@@ -279,7 +279,7 @@ def test_a_scene_that_cannot_be_built_shows_why(tmp_path):
 
 def test_plots_are_of_the_columns_with_their_units():
     results = argon().run()
-    figure = rigidmd.view.plot(results, "temperature_translation", "pressure_bar", "temperature")
+    figure = rigidmd.view.plot(results, "temperature_translation", "pressure", "temperature")
     kelvin, pressure = figure.axes
     titles = [axis.get_title(loc="left") for axis in figure.axes]
     assert titles == ["temperature translation, temperature (K)", "pressure (bar)"]
@@ -289,7 +289,7 @@ def test_plots_are_of_the_columns_with_their_units():
         "temperature",
     ]
     stages = pressure.lines[:2]  # a curve for each stage
-    assert (np.concatenate([line.get_ydata() for line in stages]) == results["pressure_bar"]).all()
+    assert (np.concatenate([line.get_ydata() for line in stages]) == results["pressure"]).all()
     assert (np.concatenate([line.get_xdata() for line in stages]) == results["time"]).all()
     body = Simulation(top()).run()
     (axis,) = rigidmd.view.plot(body, "energy_error", log=True).axes

@@ -266,7 +266,7 @@ def _pair_of(run: RigidFrames) -> np.ndarray:
         k = run.system.scene.stages.index(stage)
         freedom = run.system.freedom_in(k).translation + run.system.at_rest_in(k).sum()
         momenta = BOLTZMANN * freedom * columns["temperature_translation"]
-        other = BAR * columns["pressure_bar"] - momenta / (3 * run.mean_volume)
+        other = BAR * columns["pressure"] - momenta / (3 * run.mean_volume)
     return np.array([energy / thermal_energy_of(run), other])
 
 

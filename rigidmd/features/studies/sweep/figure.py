@@ -115,7 +115,7 @@ def panels(columns: Sequence[str]) -> "tuple[Picture, list[Axes]]":
     titles = main_titles()
     figure, axes = panel_grid(len(columns), 2 if len(columns) <= MOST_PANELS else 3, 4.4, 3.0, 0.4)
     for axis, column in zip(axes, columns, strict=True):
-        title = titles.get(column, column).replace("kJ/mole", "kJ/mol")
+        title = titles.get(column, column)
         axis.set_title(title, loc="left", fontsize=9, color=INK)
         open_axis(axis, labelsize=8)
     return figure, axes

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     import pandas
 
 POTENTIAL, PRESSURE, DENSITY, DRIFT = (
-    QUANTITIES[name].mean_header for name in ("potential", "pressure_bar", "density", "drift")
+    QUANTITIES[name].mean_header for name in ("potential", "pressure", "density", "drift")
 )
 
 

@@ -118,7 +118,7 @@ def molecular_panels(system: "System", columns: Mapping[str, np.ndarray]) -> lis
     found = panel("temperature (K)", temperatures)
     found += panel(f"potential energy {per_molecule}", {"potential": ""}, count)
     found += panel(f"conserved energy since its stage began {per_molecule}", {"drift": ""}, count)
-    found += panel("pressure (bar)", {"pressure_bar": ""})
+    found += panel("pressure (bar)", {"pressure": ""})
     if "density" in columns and np.ptp(np.nan_to_num(columns["density"])) > 0:
         found += panel("density (g/cm³)", {"density": ""})
         found += panel("edges of the box (Å)", {edge: edge for edge in "abc"})

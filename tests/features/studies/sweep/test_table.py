@@ -24,9 +24,9 @@ def test_the_energy_of_a_molecule_has_its_fraction_of_the_error(finished):
     columns["time"] = np.linspace(0.0, 0.5, 40)
     columns["potential"] = np.random.default_rng(1).standard_normal(40) - 5.0
     found = summarise_run(replace(record, columns=columns))
-    energy, error = found["Potential Energy (kJ/mole)"]
+    energy, error = found["Potential Energy (kJ/mol)"]
     assert error > 0.1
-    assert found["Potential Energy per molecule (kJ/mole)"] == pytest.approx(
+    assert found["Potential Energy per molecule (kJ/mol)"] == pytest.approx(
         (energy / 20, error / 20)
     )
 
@@ -55,20 +55,20 @@ timestep_fs = 5
     folder = tmp_path / "s"
     points = run_here(scene, [parse_axis(f"{together}=90,110")], folder).points
     said = printed("sweep", scene, "-o", folder, "--collect").out
-    assert "density: Density (g/mL)" in said
+    assert "density: Density (g/cm^3)" in said
     for row, point in zip(table(folder), points, strict=True):
         stage = json.loads((folder / point.folder / "summary.json").read_text())["stages"][0]
-        assert float(row["density: Density (g/mL)"]) == pytest.approx(
+        assert float(row["density: Density (g/cm^3)"]) == pytest.approx(
             stage["density_g_cm3"], rel=1e-6
         )
         if stage["density_error_g_cm3"] is not None:
-            assert float(row["density: Density (g/mL) error"]) == pytest.approx(
+            assert float(row["density: Density (g/cm^3) error"]) == pytest.approx(
                 stage["density_error_g_cm3"], rel=1e-6
             )
         assert float(row["density: Temperature (K)"]) == pytest.approx(
             stage["temperature_K"], rel=1e-6
         )
-        assert "Density (g/mL) error" not in row  # it is constant in the last stage
+        assert "Density (g/cm^3) error" not in row  # it is constant in the last stage
 
 
 @pytest.mark.parametrize(
