@@ -5,11 +5,11 @@ Examples
     import rigidmd
 
     results = rigidmd.Simulation("water.toml").run()
-    print(results["temperature"].mean(), results.units["temperature"], results.universe())
+    print(results.mean("temperature"), results["temperature"], results.universe())
 
     with rigidmd.Simulation("water.toml") as simulation:
         simulation.step(100)  # the first 100 steps. simulation.run() would run the rest
-        print(simulation.state.time, simulation.state.position)
+        print(simulation.time, simulation.state.position)
 
     results = rigidmd.read_run("runs/water")  # of an earlier run
 """

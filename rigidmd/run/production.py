@@ -1,10 +1,11 @@
 """Means over the production of a run of molecules, for `Results.mean`."""
 
+from math import isnan, nan
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
-from rigidmd.core.quantities import Quantity
+from rigidmd.core.quantities import Quantity, current_name
 from rigidmd.core.statistics import format_with_error, mean_and_error
 from rigidmd.engines.samples import Samples, equilibrated
 from rigidmd.errors import OutputError
@@ -23,11 +24,15 @@ NOT_KNOWN = (
 
 
 class Estimate(NamedTuple):
+    """A mean with its standard error, which is NaN if the run is too short for an error."""
+
     value: float
-    error: float  # standard error
+    error: float
     unit: str
 
     def __str__(self) -> str:
+        if isnan(self.error):
+            return f"{self.value:.6g} {self.unit} (too short for an error)"
         return f"{format_with_error(self.value, self.error)} {self.unit}"
 
 
@@ -35,8 +40,12 @@ def mean_of_production(results: "Results", name: str, *, zero_step: bool) -> Est
     """See `Results.mean`."""
     samples, system = results.samples, cast("System", results.system)
     if not isinstance(samples, Samples):
-        raise OutputError("mean() is for runs of molecules, and this is one of a single body")
+        raise OutputError(
+            "mean() is for runs of molecules, and this is one of a single body: results[column] has"
+            " all samples"
+        )
     known = {alias: row for row in system.quantities.values() for alias in _names(row)}
+    name = current_name(name, system.quantities)
     if name not in known:
         raise KeyError(f"no mean of {name!r}; there are {', '.join(known)}")
     quantity = known[name]
@@ -48,8 +57,9 @@ def mean_of_production(results: "Results", name: str, *, zero_step: bool) -> Est
     columns = equilibrated(samples.of_stage(k), stage)
     values = columns[quantity.name]
     value, error = mean_and_error(values[np.isfinite(values)])
-    if value is None or error is None:
-        raise OutputError(f"the run is too short for an error of {name}")
+    if value is None:
+        raise OutputError(f"the last stage of motion has no value of {name}")
+    error = nan if error is None else error
     if zero_step:
         feature = provider("step_biases", "mean(zero_step=True)")
         table = {name: columns[name] for name, row in columns.described.items() if row.unit}

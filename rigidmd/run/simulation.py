@@ -24,7 +24,7 @@ import numpy as np
 
 from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.core.display import Displayed
-from rigidmd.core.state import State
+from rigidmd.core.state import NOW, State
 from rigidmd.core.toml import Json
 from rigidmd.core.user_warnings import warn_user
 from rigidmd.errors import RigidMDError, SceneError
@@ -137,7 +137,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
 
         with rigidmd.Simulation("water.toml", "runs/water") as simulation:
             simulation.step(100)
-            print(simulation.state.time, simulation.energy)
+            print(simulation.time, simulation.energy)
     """
 
     _part: RunPart
@@ -250,6 +250,16 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         SI units. Runs start from another state by `start_from`.
         """
         return self._part.state.read_only
+
+    @property
+    def time(self) -> float:
+        """Time since the start of the run, ps, for a body s."""
+        return float(self._part.state.time[NOW])
+
+    @property
+    def steps_done(self) -> int:
+        """Number of steps since the start of the run."""
+        return int(self._part.state.step[NOW])
 
     @property
     def observation(self) -> "Observation | NamedTuple":

@@ -1,8 +1,11 @@
 """`Results.mean`: `run/production.py`."""
 
-import pytest
-from support.common import small_scene
+from math import isnan
 
+import pytest
+from support.common import ROOT, small_scene
+
+import rigidmd
 from rigidmd import Simulation
 from rigidmd.errors import OutputError
 from rigidmd.run.production import Estimate
@@ -42,6 +45,19 @@ def test_a_mean_is_the_mean_of_the_summary():
         results.mean("temperature", zero_step=True)
 
 
+def test_a_mean_of_a_stored_run_and_of_a_body(tmp_path):
+    scene = small_scene({"argon": 8}, 20.0, stages=[{"duration_ps": 2.0, "timestep_fs": 10.0}])
+    results = Simulation(scene, tmp_path / "run").run()
+    for name in ("temperature", "potential_energy"):
+        found = rigidmd.read_run(tmp_path / "run").mean(name)
+        assert found == results.mean(name) and found.error > 0
+    with pytest.warns(DeprecationWarning, match="pressure_bar is pressure now"):
+        assert results.mean("pressure_bar") == results.mean("pressure")
+    body = rigidmd.Scene.read(ROOT / "systems" / "heavy_top_3.toml", {"run.duration_s": 0.1})
+    with pytest.raises(OutputError, match=r"one of a single body: results\[column\] has all"):
+        Simulation(body).run().mean("energy")
+
+
 def test_a_mean_that_is_not_known_has_a_reason():
     results = results_of("nve")
     assert results.mean("temperature").unit == "K"
@@ -50,5 +66,7 @@ def test_a_mean_that_is_not_known_has_a_reason():
     ):
         results.mean("potential", zero_step=True)
     short = results_of("nvt", 0.2, temperature_K=120.0)
-    with pytest.raises(OutputError, match="too short for an error of potential"):
-        short.mean("potential")
+    assert isnan(short.mean("potential").error)
+    assert str(short.mean("temperature")).endswith("K (too short for an error)")
+    values = short["potential"][short["stage"] == 1]
+    assert short.mean("potential").value == pytest.approx(values.mean() / 32)

@@ -37,7 +37,7 @@ def read_run(folder: str | Path) -> Results | Table:
     Examples
     --------
         results = rigidmd.read_run("runs/water")
-        print(results["temperature"].mean(), results.summary)
+        print(results.mean("temperature"), results.summary)
         print(rigidmd.analysis.rdf(results, "OW", "OW"))
 
         table = rigidmd.read_run("runs/water-sweep")
