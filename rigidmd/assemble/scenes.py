@@ -30,7 +30,22 @@ SHAPES = {"FixLinearTriatomic", "FixInternals"}
 
 def to_atoms(scene: MolecularScene) -> "ase.Atoms":
     """The start of a run as an `ase.Atoms`, before overlaps are removed: see `Results.atoms`.
-    Raises as `rigidmd.with_defaults`."""
+
+    Parameters
+    ----------
+    scene : MolecularScene
+        The scene of molecules
+
+    Returns
+    -------
+    ase.Atoms
+        The sites with mass (a,), positions in Å
+
+    Raises
+    ------
+    SceneError, StructureError, MoleculeError
+        As `rigidmd.with_defaults`.
+    """
     system = build(scene)
     return atoms_of_system(system, system.state)
 
@@ -44,23 +59,29 @@ def scene_from_atoms(
 
     Cell, periodicity (along all axes or none) and momenta are used. Massless sites, such as M of
     TIP4P, need not be among the atoms. The scene contains the atoms. A run in a folder writes them
-    there.
-
-    Atoms that do not match the models are found when the system is built.
+    there. Atoms that do not match the models are found when the system is built.
 
     Parameters
     ----------
-    models
+    atoms : ase.Atoms
+        Atoms of whole molecules
+    models : str, dict or sequence of these
         Names of shipped models or paths of .toml files, or tables like [[molecules]] of a scene
         file
-    settings
+    **settings : object
         The other tables and keys of a scene file: forces={"cutoff_A": 9.0}, stages=[{...}], seed=3.
         start={"temperature_K": 300} draws momenta instead of using the atoms' momenta. Default of
         stages: 1 ps of nve, or a minimisation if neither atoms nor settings give momenta
 
+    Returns
+    -------
+    MolecularScene
+        The scene
+
     Raises
     ------
     SceneError
+        With all errors.
     """
     if errors := atoms_errors(atoms):
         raise SceneError(SOURCE, errors)

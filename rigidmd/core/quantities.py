@@ -96,7 +96,7 @@ class Quantity:
 
 
 def current_name(name: str, described: Mapping[str, Quantity]) -> str:
-    """The name of a quantity by this name, or by that of the version before."""
+    """The name of a quantity by this name, or by its former one."""
     if name not in described:
         for row in described.values():
             if row.former and row.former == name:

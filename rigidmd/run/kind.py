@@ -183,8 +183,19 @@ def kinds() -> list[Kind]:
 
 
 def with_defaults(scene: AnyScene) -> AnyScene:
-    """The same scene with all defaults, which runs to the same bits. The integrator "auto" stays
-    until a run has chosen one.
+    """The same scene with all defaults, which runs to the same bits.
+
+    The integrator "auto" stays until a run has chosen one.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene
+
+    Returns
+    -------
+    Scene
+        A scene of the same kind
 
     Raises
     ------

@@ -35,15 +35,15 @@ class Moment:
     """The argument of observers: position in the run, state and observation. Its values do not
     change later.
 
-    Parameters
+    Attributes
     ----------
-    step
+    step : int
         Steps since the start
-    time
-        In ps, or s for a single body
-    stage
+    time : float
+        Time since the start, ps, or s for a single body
+    stage : int
         Index of the stage
-    state
+    state : State
         For molecules in Å, Å/ps and u Å²/ps (angular momentum along principal axes), for a body in
         SI units
     """
@@ -87,11 +87,15 @@ def above_zero(interval: float, name: str) -> float:
 
 
 class Observer:
-    """Base class. Its methods have no effect.
+    """Base class of observers. Its methods have no effect.
 
-    Parameters
+    Attributes
     ----------
-    remembers
+    interval : float or None
+        Time between observations, ps, or s for a single body
+    steps : int or None
+        Number of steps between observations
+    remembers : dict of str to type
         Name -> type of each attribute that a checkpoint has and a resumed run gets back: an array
         (`np.ndarray`), arrays by name (`dict[str, np.ndarray]`), or what JSON can hold, which is
         checked
@@ -110,14 +114,31 @@ class Observer:
     _names: Sequence[str] = ()
 
     def files(self) -> list[str]:
-        """Names of all files that may be written."""
+        """Names of all files that may be written.
+
+        Returns
+        -------
+        list of str
+            Names in the folder of the run
+        """
         return list(self._names)
 
     def begin(self, run: "Simulation") -> None:
-        """Called before the first step. The folder exists."""
+        """Called before the first step. The folder exists.
+
+        Parameters
+        ----------
+        run : Simulation
+            The simulation that starts
+        """
 
     def observe(self, moment: Moment) -> None:
         """Observe a moment.
+
+        Parameters
+        ----------
+        moment : Moment
+            Position in the run, state and observation
 
         Raises
         ------
@@ -126,19 +147,41 @@ class Observer:
         """
 
     def see(self, moment: Moment) -> None:
-        """`observe` by its name of the version before."""
+        """`observe` by its name of the version before.
+
+        Parameters
+        ----------
+        moment : Moment
+            See `observe`
+        """
         type(self).observe(self, moment)
 
     def memory(self) -> Checkpoint:
         """The data that `resume` needs, for a checkpoint. Its files must be on the disk when it
-        returns."""
+        returns.
+
+        Returns
+        -------
+        Checkpoint
+            The attributes that `remembers` lists
+        """
         return stored(self, self.remembers)
 
     def resume(self, run: "Simulation", kept: Checkpoint) -> None:
         """Called instead of `begin` when a run is resumed: restore the data of `memory`, and check
         files unchanged.
 
-        The run is rejected if this raises KeyError, TypeError, ValueError or OutputError.
+        Parameters
+        ----------
+        run : Simulation
+            The simulation that is resumed
+        kept : Checkpoint
+            What `memory` returned
+
+        Raises
+        ------
+        KeyError, TypeError, ValueError, OutputError
+            To reject the checkpoint.
         """
         for name, value in restored(kept, self.remembers).items():
             setattr(self, name, value)
@@ -148,14 +191,32 @@ class Observer:
         """Called when all observers have resumed: cut files to their lengths at the checkpoint."""
 
     def end(self, run: "Simulation", results: "Results") -> None:
-        """Called after the last step or an interruption: complete the files."""
+        """Called after the last step or an interruption: complete the files.
+
+        Parameters
+        ----------
+        run : Simulation
+            The simulation that ends
+        results : Results
+            The results, to which files may be added
+        """
 
     def close(self) -> None:
         """Called in any case: close files."""
 
     def failed(self, run: "Simulation") -> str:
-        """Called if the run stops with an error: save results. Returns a sentence that names the
-        file, or ""."""
+        """Called if the run stops with an error: save results.
+
+        Parameters
+        ----------
+        run : Simulation
+            The simulation that stops
+
+        Returns
+        -------
+        str
+            A sentence that names the file, or ""
+        """
         return ""
 
 
@@ -189,7 +250,20 @@ def as_observer(value: object) -> Observer:
 
 
 class Every(Observer):
-    """Calls `function(moment)` every `interval` ps (s for a single body), once for each time."""
+    """Calls a function at an interval of time, once for each time.
+
+    Parameters
+    ----------
+    interval : float
+        Time between calls, ps, or s for a single body
+    function : callable
+        Called with each `Moment`
+
+    Raises
+    ------
+    ValueError
+        For an interval that is not a finite time above 0.
+    """
 
     once = True
 
@@ -198,6 +272,13 @@ class Every(Observer):
         self.function = function
 
     def observe(self, moment: Moment) -> None:
+        """Call the function.
+
+        Parameters
+        ----------
+        moment : Moment
+            Its argument
+        """
         self.function(moment)
 
 

@@ -34,16 +34,18 @@ class Results(Displayed):
     whole system, K, bar, Å, ps) or, for a body, in SI units. `units` lists all columns with their
     units.
 
-    Parameters
+    Attributes
     ----------
-    summary
+    summary : dict
         Values with units in their keys, as in summary.json
-    files
+    files : list of Path
         Paths of the files written
-    interrupted
+    interrupted : bool
         Whether the run ended early, by a signal or at its walltime (`out_of_time`)
-    signal
+    signal : int or None
         Number of the signal, 2 for Ctrl-C, 15 for SIGTERM
+    out_of_time : bool
+        Whether the run ended at its walltime
     """
 
     system: "AnySystem"
@@ -112,23 +114,33 @@ class Results(Displayed):
 
         Parameters
         ----------
-        name
+        name : str
             Name of a column, or of a row of the summary with underscores: "potential_energy"
-        zero_step
+        zero_step : bool, optional
             At a time step of zero, from the fluctuations in the run: see `rigidmd analyse RUN
             zero_step`
+
+        Returns
+        -------
+        Estimate
+            `value`, `error` (NaN if the run is too short for one) and `unit`
 
         Raises
         ------
         KeyError
             With all names.
         OutputError
-            Without a mean or an error, or if what the step adds to it is not known.
+            For a single body, without a value, or if what the step adds to it is not known.
         """
         return mean_of_production(self, name, zero_step=zero_step)
 
     def to_dataframe(self) -> "pandas.DataFrame":
         """The samples under the headers of log.csv (motion.csv of a body).
+
+        Returns
+        -------
+        pandas.DataFrame
+            A line for each sample
 
         Raises
         ------
@@ -151,6 +163,11 @@ class Results(Displayed):
 
         Lengths in Å, times in ps. For a body a second becomes a picosecond. Every frame has its
         time in the run, also where the file format has none. Warns if frames are not evenly spaced.
+
+        Returns
+        -------
+        MDAnalysis.Universe
+            All sites, with elements, masses, charges and bonds
 
         Raises
         ------
@@ -183,14 +200,24 @@ class Results(Displayed):
     @overload
     def atoms(self, frame: str) -> "ase.Atoms | list[ase.Atoms]": ...
     def atoms(self, frame: int | slice | str | None = None) -> "ase.Atoms | list[ase.Atoms]":
-        """The final state of molecules as an `ase.Atoms`, or frames of the trajectory: one for an
-        index, a list for a slice or a text like ":" or "::10", as in `ase.io.read`.
+        """The final state of molecules as an `ase.Atoms`, or frames of the trajectory.
 
         Atoms are the sites with mass, with the masses of the models, cell, periodicity,
         `info["time_ps"]` and, where frames have velocities, momenta. The final state, and a last
         frame at its time, is exact, with energy, forces and stress. Other frames have the digits of
         the trajectory (single precision but for .traj), and the energy where the log has a line at
         their time. So has the final state of a run that was read from a folder, without forces.
+
+        Parameters
+        ----------
+        frame : int, slice or str, optional
+            Index of a frame, or several as a slice or a text like ":" or "::10", as in
+            `ase.io.read`. Default: the final state
+
+        Returns
+        -------
+        ase.Atoms or list of ase.Atoms
+            A list for several frames. Positions in Å, energies in eV
 
         Raises
         ------

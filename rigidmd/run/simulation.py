@@ -97,39 +97,46 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
 
     Parameters
     ----------
-    scene
+    scene : Scene, str or Path
         The scene, or the path of its TOML file
-    folder
+    folder : str or Path, optional
         Folder for the files. None writes nothing and keeps the frames in memory
-    force
+    force : bool, optional
         Replace an earlier run in that folder
-    observers
-        user-defined, called between steps: `Every`, `LivePlot`, any object with `interval` and
+    observers : Observer or sequence of Observer, optional
+        Called between steps: `Every`, `LivePlot`, or any object with `interval` and
         `observe(moment)`
-    `say`
+    say : callable, optional
         Called with a sentence before something slow (compiling, pilot runs). Default: printed with
         the progress
-    warn
+    warn : callable, optional
         Called with each warning. The summary repeats them. Default: a `RigidMDWarning` of Python's
         `warnings`
-    resume
-        Continue from the last checkpoint in the folder, to the same bits. Begin if the folder is
-        empty or absent
-    walltime
+    resume : bool, optional
+        Continue from the last checkpoint in the folder, to the same bits. If the folder is empty or
+        absent, a new run starts
+    walltime : float, optional
         Seconds from now until the run has to have ended. It stops shortly before, with a checkpoint
-    forces
+    forces : object or sequence of objects, optional
         For molecules, user-defined forces, in addition to the forces of the scene: `rigidmd.Force`,
         `rigidmd.pair_potential`, terms of classes with `rigidmd.compiled_force`, or objects whose
         method term(system) makes such a term. At the start forces and torques are compared with
         differences of the energy, and the virial with the effect of a strain of the box
-    thermostat
+    thermostat : object, optional
         For molecules, a user-defined thermostat for every stage: a NamedTuple of a class with
         `rigidmd.compiled_thermostat`, or an object whose method for_stage(system, k) makes one
-    applied
+    applied : dict of str to callable, optional
         For a single body, name -> function of a `Pose` that gives a force (3,) in N along the lab's
         axes, at the centre of mass, and a torque (3,) in N m along the body's axes. It is called
         once for each position of the body. Forces that depend on the velocity are constant within a
         step, which reduces its order to 1
+
+    Raises
+    ------
+    SceneError
+        If the scene has errors, or does not take one of the arguments.
+    TypeError, ValueError
+        For arguments of other types or values.
 
     Examples
     --------
@@ -299,6 +306,16 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
     def path(self, file: str) -> Path:
         """Path of a file in the folder of the run.
 
+        Parameters
+        ----------
+        file : str
+            Name of the file, such as "log.csv"
+
+        Returns
+        -------
+        Path
+            Its absolute path
+
         Raises
         ------
         ValueError
@@ -351,10 +368,16 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
 
         Parameters
         ----------
-        state
+        state : State
             A state of as many molecules in the same order, or of a body, in the units of `state`,
-            such as `results.state`. Time and step start at 0. Raises StructureError for a state
-            that this scene cannot have, TypeError for anything else.
+            such as `results.state`. Time and step start at 0
+
+        Raises
+        ------
+        StructureError
+            For a state that this scene cannot have.
+        TypeError
+            For anything else.
         """
         part = self._before_run()
         if not isinstance(state, State):
@@ -377,7 +400,18 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
 
     def atoms(self) -> "ase.Atoms":
         """The current state of molecules as an `ase.Atoms`, exactly: see `Results.atoms`. Observers
-        may call it."""
+        may call it.
+
+        Returns
+        -------
+        ase.Atoms
+            The sites with mass (a,), positions in Å
+
+        Raises
+        ------
+        TypeError
+            For a single body.
+        """
         part = self._molecules(begun=True)
         with part.lock:
             return part.atoms()
@@ -387,6 +421,11 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         on a login node.
 
         A stage with integrator = "auto" compiles more when pilot runs have chosen.
+
+        Raises
+        ------
+        RuntimeError
+            Within a run.
         """
         self._before_run().prepare()
         self._part.reset()
@@ -408,9 +447,14 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
 
         Parameters
         ----------
-        progress
+        progress : bool, optional
             Whether to show progress, by a bar or, if not on a terminal, lines every 30 s. Default:
             in notebooks
+
+        Returns
+        -------
+        Results
+            Samples, summary, final state and files of the run
 
         Raises
         ------
@@ -430,17 +474,26 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         return cast(Results, self._drive(inf, progress=progress).results)
 
     def step(self, count: int = 1) -> int:
-        """Advance by a number of steps, as `run` does. Returns the number done: fewer at the end of
-        the scene, then 0.
+        """Advance by a number of steps, as `run` does.
 
         The first call starts the run: it compiles and writes the first files. A minimisation is
         done with the next step after it. `run` or `close` completes the run. A signal such as
         Ctrl-C completes all files. The exception is then re-raised.
 
+        Parameters
+        ----------
+        count : int, optional
+            Number of steps. Default: 1
+
+        Returns
+        -------
+        int
+            Number of steps done: fewer at the end of the scene, then 0
+
         Raises
         ------
         TypeError, ValueError
-            For a count that is not whole, or below 1. Errors of `run` occur here too.
+            For a count that is not an integer, or below 1. Errors of `run` occur here too.
         """
         return self._drive(checked_count(count, "the number of steps"), progress=False).advanced
 
@@ -462,8 +515,8 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
 
         Parameters
         ----------
-        number
-            Of the signal that requests it
+        number : int, optional
+            Number of the signal that requests it
         """
         if self._loop is not None:
             self._loop.stop(number)
@@ -537,21 +590,34 @@ POLL_INTERVAL = 0.2
 def run_together(
     simulations: Sequence[Simulation], jobs: int | None = None
 ) -> list[Results | None]:
-    """Run simulations at once, each on one thread. Their results in the same order, with the bits
-    of `run`.
+    """Run simulations at once, each on one thread, to the bits of `run`.
 
     For many small systems this is faster than one run after another on all cores: no thread waits
     for another, and the steps of one run continue while the observers of another are called.
+    Summaries and scenes of the simulations have one thread.
 
-    Ctrl-C and SIGTERM stop all runs at their next observations. A run that had not begun is None in
-    the list. A second Ctrl-C then raises KeyboardInterrupt. If a run fails, the others continue,
-    and the first error is raised at the end, with a note on the runs that failed. Summaries and
-    scenes of the simulations have one thread.
+    Ctrl-C and SIGTERM stop all runs at their next observations. A second Ctrl-C then raises
+    KeyboardInterrupt. If a run fails, the others continue, and the first error is raised at the
+    end, with a note on the runs that failed.
 
     Parameters
     ----------
-    jobs
-        Runs at a time. Default: the number of cores
+    simulations : sequence of Simulation
+        The simulations, none of them twice
+    jobs : int, optional
+        Number of runs at a time. Default: the number of cores
+
+    Returns
+    -------
+    list of Results or None
+        The results in the same order. None for a run that had not started before a signal
+
+    Raises
+    ------
+    TypeError, ValueError
+        For anything but different simulations, or a number of jobs below 1.
+    RigidMDError
+        The first error of a run.
     """
     from concurrent.futures import ThreadPoolExecutor, wait
 

@@ -144,7 +144,17 @@ class Scene(Section, Displayed):
         return self._source
 
     def with_end(self, time: float) -> "Scene":
-        """The same scene with its end at a time of the run, ps.
+        """The same scene with its end at a time of the run.
+
+        Parameters
+        ----------
+        time : float
+            End of the last stage, ps, of the run of a body s
+
+        Returns
+        -------
+        Scene
+            A copy with another end
 
         Raises
         ------
@@ -154,8 +164,18 @@ class Scene(Section, Displayed):
         raise NotImplementedError
 
     def path(self, file: str) -> Path:
-        """Path of a file that the scene names relative to its folder, absolute if the working
-        directory has changed."""
+        """Path of a file that the scene names relative to its folder.
+
+        Parameters
+        ----------
+        file : str
+            The name, relative to the folder of the scene
+
+        Returns
+        -------
+        Path
+            The path, absolute if the working directory has changed
+        """
         is_same = _working_directory() == self._read_in
         return (self._folder if is_same else self._read_in / self._folder) / file
 
@@ -184,15 +204,27 @@ class Scene(Section, Displayed):
     def read(cls, path: PathName, overrides: Json | None = None) -> "OneScene": ...
     @classmethod
     def read(cls, path: PathName, overrides: Json | None = None) -> "Scene":
-        """The scene in a TOML file, with single keys overridden: {"stages.1.timestep_fs": 4}.
+        """The scene in a TOML file, with single keys overridden.
 
-        An override of None removes the key. Files named in the scene must lie in its folder or
-        below. Files named in `overrides` may be anywhere, and are taken relative to the working
-        directory.
+        Files named in the scene must lie in its folder or below. Files named in `overrides` may be
+        anywhere, and are taken relative to the working directory.
+
+        Parameters
+        ----------
+        path : str or Path
+            Path of the TOML file
+        overrides : dict, optional
+            Dotted key -> value, such as {"stages.1.timestep_fs": 4}. None removes the key
+
+        Returns
+        -------
+        MolecularScene or BodyScene
+            A scene of the kind that its tables show
 
         Raises
         ------
         SceneError
+            With all errors.
         """
         path = Path(path)
         data, text = read_tables(path)
@@ -238,10 +270,23 @@ class Scene(Section, Displayed):
 
         Parameters
         ----------
-        source, text
-            Path of the TOML file, for messages, and its text, for the numbers of lines in them
-        embedded_files
+        data : dict
+            The tables of the scene
+        folder : str or Path, optional
+            Folder of the files that the scene names. Default: the working directory
+        overrides : dict, optional
+            Dotted key -> value, as in `read`
+        source : str, optional
+            Path of the TOML file, for messages
+        text : str, optional
+            Text of the TOML file, for the numbers of lines in messages
+        embedded_files : dict of str to bytes, optional
             See `embedded_files`. With them, files may be outside `folder`
+
+        Returns
+        -------
+        MolecularScene or BodyScene
+            A scene of the kind that its tables show
 
         Raises
         ------

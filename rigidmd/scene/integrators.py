@@ -114,25 +114,39 @@ def register_integrator(
     gradients: Sequence[float] | None = None,
     source: str = "",
 ) -> str:
-    """Register coefficients as an integrator, and return its name, which scenes then accept.
+    """Register a scheme as an integrator, which scenes then accept by its name.
 
-    Fractions sum to 1 and read the same from both ends. A scene that names the row keeps its
-    coefficients in its table [[integrators]], so that its file and the folder of its run are
-    complete.
+    Fractions sum to 1 and read the same from both ends. Give `steps`, or `kicks` and `drifts`. A
+    scene that names the scheme keeps its coefficients in its table [[integrators]], so that its
+    file and the folder of its run are complete.
 
     Parameters
     ----------
-    steps
-        Lengths of successive velocity Verlet steps, as fractions of the time step, or
-    kicks, drifts
-        Fractions of kick, drift, ..., drift, kick
-    gradients
-        Of each kick, tau/dt² without the fraction of the kick: 1/12 in both kicks of kick(1/2)
+    name : str
+        Name in scenes
+    order : int
+        Order of the scheme, 2 or an even number
+    steps : sequence of float, optional
+        Lengths of successive velocity Verlet steps, as fractions of the time step
+    kicks : sequence of float, optional
+        Fractions of the kicks of kick, drift, ..., drift, kick
+    drifts : sequence of float, optional
+        Fractions of the drifts between the kicks
+    gradients : sequence of float, optional
+        For each kick, tau/dt² without the fraction of the kick: 1/12 in both kicks of kick(1/2)
         drift(1) kick(1/2) is the scheme of Takahashi and Imada
+    source : str, optional
+        Publication of the scheme
+
+    Returns
+    -------
+    str
+        The name
 
     Raises
     ------
     SceneError
+        If the coefficients are invalid.
 
     Examples
     --------

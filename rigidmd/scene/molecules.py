@@ -245,11 +245,22 @@ class MolecularScene(CouplingKeys, MatterKeys):
         return scene
 
     def with_end(self, time: float) -> "MolecularScene":
-        """The same scene with a last stage that ends at a time of the run, ps.
+        """The same scene with a last stage that ends at a time of the run.
+
+        Parameters
+        ----------
+        time : float
+            End of the last stage, ps since the start of the run
+
+        Returns
+        -------
+        MolecularScene
+            A copy with another end
 
         Raises
         ------
         SceneError
+            If the end cannot be set.
         """
         before = sum(stage.duration for stage in self.stages[:-1])
         last = self.stages[-1]

@@ -309,7 +309,7 @@ def test_recorded_output_is_of_the_scene_with_the_defaults_of_today(
             cli.main([*words[1:], "--force"])
         runs = [parse(words[1:]) for words in quoted.commands]
         scenes = [
-            resolve(read_scene(options))
+            with_defaults(read_scene(options))
             for options, words in zip(runs, quoted.commands, strict=True)
             if words[1] == "run"
         ]

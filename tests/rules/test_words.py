@@ -77,7 +77,7 @@ ALLOWED = re.compile(
     | turns?\ (?:on|off|out)|in\ turns?|turned\ (?:on|off)
     | takes?\ place|took\ place|taking\ place|in\ place(?:\ of)?|decimal\ places?|first\ place
     | (?:its|their|your|his|our)\ own                                         # but not "one's own"
-    | rigidmd\ film|film\.\w+|are\ no\ exception
+    | rigidmd\ film|film\.\w+|are\ no\ exception|say\ :\ callable
     | no\ longer|(?:is\ )?no\ such|no\ more|no\ less|books?\ of\ \w+
     | look(?:s|ed|ing)?\ (?:up|for|at|like)|what\ to\ look\ at              # of people
     """,

@@ -734,6 +734,7 @@ def test_run_with_a_number_of_steps_names_step(count):
 def test_a_simulation_shows_what_is_for_users():
     shown = {name for name in dir(Simulation) if not name.startswith("_")}
     values = {"scene", "system", "engine", "threads", "state", "observation", "energy", "forces"}
+    values |= {"time", "steps_done"}
     verbs = {"run", "step", "stop", "close", "compile", "start_from", "atoms", "path", "notes"}
     assert shown == values | verbs
     simulation = Simulation(ROOT / "systems" / "heavy_top_3.toml")

@@ -9,7 +9,7 @@ the equilibration. Other arguments are described by help() of the function. They
 
 from collections.abc import Callable, Sequence
 from functools import cache
-from inspect import Parameter, signature
+from inspect import Parameter, getdoc, signature
 from pathlib import Path
 
 from rigidmd.features.analysis import registry
@@ -25,7 +25,29 @@ __all__ = ["analyse", "register", *registry.known()]  # pyright: ignore[reportUn
 def analyse(
     results: Results, name: str, /, start: float | None = None, **options: object
 ) -> AnalysisResult:
-    """The result of an analysis by its name, built-in or added by `register`."""
+    """The result of an analysis by its name, built-in or added by `register`.
+
+    Parameters
+    ----------
+    results : Results or sequence of Results
+        Results of a run, or of replicas, which are analysed together
+    name : str
+        Name of the analysis
+    start : float, optional
+        First time that is used, ps. Default: the detected end of the equilibration
+    **options : object
+        The other arguments of the function of this name
+
+    Returns
+    -------
+    AnalysisResult
+        Values with errors, curves and notes
+
+    Raises
+    ------
+    OutputError
+        For an unknown name, or as the function of this name.
+    """
     (entry,) = selected([name])
     return _function_of_results(entry)(results, start=start, **options)
 
@@ -84,5 +106,34 @@ def _function_of_results(entry: Analysis) -> Callable[..., AnalysisResult]:
     parameters.sort(key=lambda parameter: parameter.kind is Parameter.KEYWORD_ONLY)
     function.__signature__ = ours.replace(parameters=parameters)  # pyright: ignore[reportFunctionMemberAccess]
     function.__name__ = function.__qualname__ = entry.name
-    function.__doc__ = entry.function.__doc__
+    function.__doc__ = _with_common_entries(getdoc(entry.function) or entry.about)
     return function
+
+
+PARAMETERS = "Parameters\n----------\n"
+RESULTS = """\
+results : Results or sequence of Results
+    Results of a run, or of replicas, which are analysed together
+"""
+START = """\
+start : float, optional
+    First time that is used, ps. Default: the detected end of the equilibration
+
+Returns
+-------
+AnalysisResult
+    Values with errors, curves and notes
+
+Raises
+------
+OutputError
+    If the run lacks what the analysis needs.
+"""
+
+
+def _with_common_entries(doc: str) -> str:
+    """The docstring of an analysis, whose last section is that of its options, with the entries
+    that all have."""
+    text, _, options = doc.partition(PARAMETERS)
+    options = f"{options.rstrip()}\n" if options else ""
+    return f"{text.rstrip()}\n\n{PARAMETERS}{RESULTS}{options}{START}"

@@ -117,10 +117,18 @@ def register(function: UserFunction) -> UserFunction:
     """Register a user-defined analysis under the name of its function. `rigidmd analyse --only
     NAME` runs it.
 
-    The function gets a `rigidmd.features.analysis.rigid_frames.RigidFrames` (time, positions, Q, L,
-    velocities, cell, ...) and returns one number for each frame (f,), or a dictionary of such
-    arrays, of which means, errors, a CSV file and a figure are made. The first line of its
-    docstring is the title.
+    Parameters
+    ----------
+    function : callable
+        Called with a `rigidmd.features.analysis.rigid_frames.RigidFrames` (time, positions, Q, L,
+        velocities, cell, ...). It returns one number for each frame (f,), or a dictionary of such
+        arrays, of which means, errors, a CSV file and a figure are made. The first line of its
+        docstring is the title
+
+    Returns
+    -------
+    callable
+        The same function
 
     Raises
     ------

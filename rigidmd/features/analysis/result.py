@@ -36,7 +36,20 @@ MIN_CORRELATION_TIMES = 20.0
 class Value(NamedTuple):
     """A value with its standard error, or a note on why there is none.
 
-    correlation_ps : correlation time of the data
+    Attributes
+    ----------
+    name : str
+        What it is
+    unit : str
+        Unit of value and error. "1" or empty for numbers
+    value : float or None
+        The value. None if the run is too short
+    error : float or None
+        Standard error
+    correlation_ps : float or None
+        Correlation time of the data, ps
+    note : str
+        Remark, or the reason for no value
     """
 
     name: str
@@ -63,12 +76,24 @@ class Value(NamedTuple):
 class Curve:
     """Columns over an axis: one CSV file, one figure.
 
-    file : stem of its files
-    axis : header and values (p,)
-    columns, errors : header -> values (p,). Errors under the same headers, where there are any
-    log : whether axes are logarithmic: of x, of y
-    level : a level to draw, such as 1 of g(r)
-    bars : whether the axis is of whole numbers, and bars are drawn
+    Attributes
+    ----------
+    file : str
+        Stem of its files
+    axis : tuple of str and ndarray
+        Header and values (p,)
+    label : str
+        Title of the vertical axis
+    columns : dict of str to ndarray
+        Header -> values (p,)
+    errors : dict of str to ndarray
+        Errors (p,) under the same headers, where there are any
+    log : tuple of bool
+        Whether axes are logarithmic: of x, of y
+    level : float or None
+        A level to draw, such as 1 of g(r)
+    bars : bool
+        Whether the axis is of integers, and bars are drawn
     """
 
     file: str
@@ -98,6 +123,17 @@ class Curve:
         return table
 
     def add(self, title: str, values: np.ndarray, errors: np.ndarray) -> None:
+        """Add a column.
+
+        Parameters
+        ----------
+        title : str
+            Header of the column
+        values : ndarray
+            Values (p,)
+        errors : ndarray
+            Standard errors (p,)
+        """
         self.columns[title], self.errors[title] = values, errors
 
 
@@ -107,6 +143,19 @@ class AnalysisResult(Displayed):
 
     result["g OW-OW"] is a column of its curves, result.value("D of spce") a value. result.plot() is
     a figure, result.to_dataframe() a table.
+
+    Attributes
+    ----------
+    name : str
+        Name of the analysis
+    about : str
+        Its title
+    values : list of Value
+        Numbers with their errors
+    curves : list of Curve
+        Columns over an axis
+    notes : list of str
+        Remarks on the data
     """
 
     name: str
@@ -125,7 +174,23 @@ class AnalysisResult(Displayed):
         return known[column]
 
     def value(self, name: str = "") -> Value:
-        """The value of this name. Without a name the first. Raises KeyError with all names."""
+        """A value by its name.
+
+        Parameters
+        ----------
+        name : str, optional
+            Name of the value. Default: the first one
+
+        Returns
+        -------
+        Value
+            `value`, `error`, `unit` and, if the run is too short for a value, `note`
+
+        Raises
+        ------
+        KeyError
+            With all names.
+        """
         for value in self.values:
             if name in ("", value.name):
                 return value
@@ -137,8 +202,22 @@ class AnalysisResult(Displayed):
         """A Matplotlib figure of its curves, which a notebook displays and `savefig` writes, as
         PNG, SVG or PDF by the extension. Bands are of one standard error.
 
-        curve : name of one of `curves`. Default: a panel for each. Raises KeyError, ValueError
-            without curves
+        Parameters
+        ----------
+        curve : str, optional
+            Name of one of `curves`. Default: a panel for each
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            The figure
+
+        Raises
+        ------
+        KeyError
+            For an unknown curve.
+        ValueError
+            Without curves.
         """
         from rigidmd.features.analysis.curve_figure import curve_figure, curves_figure
 
@@ -151,11 +230,24 @@ class AnalysisResult(Displayed):
         return curves_figure(self.curves, self.about)
 
     def to_dataframe(self, curve: str = "") -> "pandas.DataFrame":
-        """The columns of a curve with their errors, as in its CSV file; of an analysis without
-        curves its values.
+        """The columns of a curve with their errors, as in its CSV file. Without curves, the values.
 
-        curve : name of one of `curves`. Default: the first. Raises KeyError, ImportError without
-            pandas
+        Parameters
+        ----------
+        curve : str, optional
+            Name of one of `curves`. Default: the first
+
+        Returns
+        -------
+        pandas.DataFrame
+            A line for each point of the axis, or for each value
+
+        Raises
+        ------
+        KeyError
+            For an unknown curve.
+        ImportError
+            Without pandas.
         """
         try:
             import pandas

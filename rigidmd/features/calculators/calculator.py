@@ -74,21 +74,24 @@ class RigidMD(Calculator):
 
     Parameters
     ----------
-    models
+    models : MolecularScene, str, dict or sequence of these
         Names of shipped models or paths of .toml files, or tables like [[molecules]] of a scene
-        file, or a scene, whose species, [forces], [fields], [coupling], precision and forces
-        from Python (`with_user_code`) are used
-    atom_forces
+        file, or a scene, whose species, [forces], [fields], [coupling], precision and forces from
+        Python are used
+    atom_forces : {"gradient", "sites"}, optional
         "gradient" of the energy of the fitted molecules, or of "sites": each atom has the forces of
         its site
-    bend, tolerance
-        Largest distance of an atom from its rigid position without a warning, and without an error,
-        over the molecule's radius
-    precision
-        "double", the default, or "mixed"
-    fields, forces
-        The table [fields] of a scene file, and keys of its table [forces]: cutoff_A,
-        electrostatics, ...
+    bend : float, optional
+        Largest distance of an atom from its rigid position without a warning, over the molecule's
+        radius
+    tolerance : float, optional
+        Largest such distance without an error, over the molecule's radius
+    precision : {"double", "mixed"}, optional
+        Precision of sums over sites. Default: "double"
+    fields : dict, optional
+        The table [fields] of a scene file
+    **forces : object
+        Keys of the table [forces] of a scene file: cutoff_A, electrostatics, ...
 
     Raises
     ------
@@ -150,7 +153,17 @@ class RigidMD(Calculator):
     def calculate(
         self, atoms: Atoms | None = None, properties=("energy",), system_changes=all_changes
     ) -> None:
-        """Energy, forces and, in a box, stress. Called by ASE."""
+        """Energy, forces and, in a box, stress. Called by ASE.
+
+        Parameters
+        ----------
+        atoms : ase.Atoms, optional
+            Atoms of whole molecules
+        properties : sequence of str, optional
+            Names of requested properties. All are computed
+        system_changes : sequence of str, optional
+            What has changed since the last call
+        """
         super().calculate(atoms, properties, system_changes)
         fitted = self._fit_atoms(not_none(self.atoms))
         if not self._warned and fitted.bent > self._bend:
@@ -174,8 +187,23 @@ class RigidMD(Calculator):
             self.results["stress"] = full_3x3_to_voigt_6_stress(full)
 
     def make_rigid(self, atoms: Atoms) -> float:
-        """Move atoms to their positions in the fitted rigid molecules. Returns the largest
-        displacement, Å."""
+        """Move atoms to their positions in the fitted rigid molecules.
+
+        Parameters
+        ----------
+        atoms : ase.Atoms
+            Atoms of whole molecules, which are moved
+
+        Returns
+        -------
+        float
+            Largest displacement, Å
+
+        Raises
+        ------
+        StructureError
+            If atoms and models do not match.
+        """
         fitted = self._fit_atoms(atoms)
         before = atoms.get_positions()
         self._put(atoms, fitted, fitted.state)
@@ -186,16 +214,24 @@ class RigidMD(Calculator):
         pressure_bar.
 
         Sets positions, and the cell with pressure_bar. Constraints of the atoms are ignored. Models
-        set what is frozen. Returns the values of the minimum, as in summary.json.
+        set what is frozen.
 
         Parameters
         ----------
-        stage_keys
+        atoms : ase.Atoms
+            Atoms of whole molecules, which are moved
+        **stage_keys : object
             Keys of a stage with ensemble = "minimise": force_limit_kJ_mol_A, pressure_bar, ...
+
+        Returns
+        -------
+        dict
+            The values of the minimum, as in summary.json
 
         Raises
         ------
         SceneError, SimulationError
+            For invalid keys, and if the minimisation fails.
         """
         assembly = self._assemble(atoms, stage_keys)
         fitted = assembly.fit(atoms)
@@ -373,16 +409,16 @@ class CalculatorForce(Force):
 
     Parameters
     ----------
-    calculator
+    calculator : ase.calculators.calculator.Calculator
         With energies (eV) and forces (eV/Å) of periodic or free atoms, as the scene has them, and
         for a barostat or the pressure with a stress (eV/Å³)
-    name
-        In logs and messages. Default: the name of the calculator's class
-    energy_noise_eV
-        Random error of its energies, as of self-consistent iterations or of single precision.
+    name : str, optional
+        Name in logs and messages. Default: the name of the calculator's class
+    energy_noise_eV : float, optional
+        Random error of its energies, eV, as of self-consistent iterations or of single precision.
         Larger differences between forces and differences of the energy are rejected at the start of
         a run
-    changes_momentum
+    changes_momentum : bool or sequence of bool, optional
         Which components of the total momentum it may change: True for external fields and
         restraints
 
@@ -414,7 +450,13 @@ class CalculatorForce(Force):
         self.changes_momentum = changes_momentum  # type: ignore[misc,assignment]
 
     def begin(self, system: System) -> None:
-        """Make the atoms, and choose the properties that the calculator computes."""
+        """Make the atoms, and choose the properties that the calculator computes.
+
+        Parameters
+        ----------
+        system : System
+            The system of molecules
+        """
         can = self.calculator.implemented_properties
         periodic = bool(np.isfinite(system.state.cell).all())
         if missing := [name for name in ("energy", "forces") if name not in can]:
@@ -434,7 +476,20 @@ class CalculatorForce(Force):
         )
 
     def on_sites(self, position: np.ndarray, state: State) -> tuple:
-        """Energy, forces on all sites, and the molecular virial where there is a stress."""
+        """Energy, forces on all sites, and the molecular virial where there is a stress.
+
+        Parameters
+        ----------
+        position : ndarray
+            Positions (s, 3) of the sites, Å
+        state : State
+            The state of the molecules
+
+        Returns
+        -------
+        tuple
+            Energy in kJ/mol, forces (s, 3) in kJ/mol/Å and the virial (3, 3) in kJ/mol
+        """
         sites = self._sites
         calculator = self.calculator
         unit = EV / KJ_PER_MOL
@@ -506,8 +561,25 @@ class CalculatorForce(Force):
 
 
 def read_rigidmd(name: str, index: int | slice = -1) -> Atoms | list[Atoms]:
-    """Frames of a run for `ase.io.read`. `name` is its folder, or the trajectory in it. Raises
-    OutputError."""
+    """Frames of a run for `ase.io.read`.
+
+    Parameters
+    ----------
+    name : str
+        Folder of the run, or the trajectory in it
+    index : int or slice, optional
+        Index of a frame, or several. Default: the last one
+
+    Returns
+    -------
+    ase.Atoms or list of ase.Atoms
+        A list for a slice
+
+    Raises
+    ------
+    OutputError
+        If the folder has no run of molecules.
+    """
     record = read_record(Path(name) if Path(name).is_dir() else Path(name).parent)
     if not is_molecular(record.scene):
         raise TypeError(f"this is a run of {record.scene.subject}, which has no atoms")

@@ -96,14 +96,20 @@ def insertion(
 
     Energies are of the forces of the run, with sums over k-vectors and the tail correction.
 
-    model : a species of the run, a shipped model or a .toml file; default: the first species
-    trials : positions and orientations in each frame
-    zero_loading : only the frozen molecules act on the trial molecule
-    axis : x, y or z for the profile along the normal of a slab
-    seed : of the trials
-    temperature : K, with zero_loading; default: the temperature of the run
-
-    Raises OutputError.
+    Parameters
+    ----------
+    model : str, optional
+        A species of the run, a shipped model or a .toml file. Default: the first species
+    trials : int, optional
+        Number of positions and orientations in each frame
+    zero_loading : bool, optional
+        Whether only the frozen molecules act on the trial molecule
+    axis : {"x", "y", "z"}, optional
+        Normal of a slab, along which there is a profile. Default: none
+    seed : int, optional
+        Seed of the trials
+    temperature : float, optional
+        Temperature with zero_loading, K. Default: the temperature of the run
     """
     if trials * runs.frame_count > MOST_TRIALS:
         raise OutputError(f"insertion has at most {MOST_TRIALS:.0e} trials in all frames together")

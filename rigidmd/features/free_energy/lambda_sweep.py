@@ -46,12 +46,18 @@ def free_energy(sweep: Table | str | Path) -> AnalysisResult:
 
     Parameters
     ----------
-    sweep
+    sweep : Table, str or Path
         What `rigidmd.sweep` or `rigidmd.read_run` returned, or the folder of a sweep
+
+    Returns
+    -------
+    AnalysisResult
+        The free energy (kJ/mol) with its error, and its curve against lambda
 
     Raises
     ------
     OutputError
+        If the folder has no such sweep, or too few points have finished.
     """
     return _free_energy(manifest_of(sweep))[0]
 

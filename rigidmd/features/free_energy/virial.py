@@ -63,8 +63,18 @@ Energy = Callable[[np.ndarray, np.ndarray], np.ndarray]
 class SecondVirial:
     """Second virial coefficients of two species at temperatures (t,).
 
-    temperature : K; B2, error : cm³/mol; dB2_dT, dB2_dT_error : cm³/(mol K)
-    samples : number of configurations
+    Attributes
+    ----------
+    species : tuple of str
+        Names of the species
+    temperature : ndarray
+        Temperatures (t,), K
+    B2, error : ndarray
+        Coefficients (t,) and their standard errors, cm³/mol
+    dB2_dT, dB2_dT_error : ndarray
+        Their derivatives (t,) and standard errors, cm³/(mol K)
+    samples : int
+        Number of configurations
     """
 
     species: tuple[str, str]
@@ -76,6 +86,13 @@ class SecondVirial:
     samples: int
 
     def table(self) -> ReportTable:
+        """A line for each temperature.
+
+        Returns
+        -------
+        ReportTable
+            Its `text()` is for a terminal
+        """
         return table_of([self])
 
 
@@ -119,21 +136,26 @@ def second_virial(
 
     Parameters
     ----------
-    first, second
-        A shipped model or the path of a .toml file; default of the second: the first
-    temperatures
-        K
-    error
-        Requested standard error of each coefficient, cm³/mol; default: 0.1 % of the larger of |B2|
+    first, second : str
+        A shipped model or the path of a .toml file. Default of the second: the first
+    temperatures : sequence of float
+        Temperatures (t,), K
+    error : float, optional
+        Requested standard error of each coefficient, cm³/mol. Default: 0.1 % of the larger of |B2|
         and |T dB2/dT|
-    forces
+    forces : sequence of objects, optional
         Potentials made by `rigidmd.pair_potential` and `rigidmd.body_pair_potential`
-    settings
+    settings : dict, optional
         Keys of a scene with their values, such as {"forces.mixing": "geometric"}
-    seed
-        Of the random orientations
-    progress
+    seed : int, optional
+        Seed of the random orientations
+    progress : callable, optional
         Called with an estimate of the fraction done
+
+    Returns
+    -------
+    SecondVirial
+        `B2`, `error` (cm³/mol), `dB2_dT` and `dB2_dT_error` (cm³/(mol K)), each (t,)
 
     Raises
     ------

@@ -44,12 +44,18 @@ def pmf(sweep: Table | str | Path) -> AnalysisResult:
 
     Parameters
     ----------
-    sweep
+    sweep : Table, str or Path
         What `rigidmd.sweep` or `rigidmd.read_run` returned, or the folder of a sweep
+
+    Returns
+    -------
+    AnalysisResult
+        The curve of the potential of mean force (kJ/mol) against the distance (Å), with errors
 
     Raises
     ------
     OutputError
+        If the folder has no such sweep, or no point has finished.
     """
     return _mean_force(manifest_of(sweep))[0]
 

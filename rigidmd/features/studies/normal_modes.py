@@ -129,36 +129,89 @@ class Coordinates:
 
 @dataclass(frozen=True, eq=False)
 class NormalModes:
-    """Modes, k of d, by ascending w²; see `normal_modes`."""
+    """Modes, k of d, by ascending w². Columns of vectors are the d mass-weighted coordinates.
+
+    Attributes
+    ----------
+    system : System
+        The system of molecules
+    coordinates : Coordinates
+        Coordinates about the minimum, which is `coordinates.state`
+    energy : float
+        Energy of the minimum, kJ/mol
+    force : float
+        Largest force at the minimum, kJ/mol/Å
+    torque : float
+        Largest torque at the minimum, kJ/mol
+    ended : str
+        Why the minimisation stopped before the rounding of forces, if it did
+    temperature : float
+        Temperature of the scene, K. 0 if it has none
+    longest_step_fs : float
+        2/w of the last mode, fs. If all were computed, the longest stable step of velocity Verlet
+    number : ndarray
+        Number (k,) of each mode among all d, from 1
+    rate : ndarray
+        Angular frequency w (k,), rad/ps. 0 for zero modes, negative for unstable modes
+    wavenumber : ndarray
+        Wavenumber w/(2 pi c) (k,), cm⁻¹
+    error : ndarray
+        Error (k,) of the wavenumber by the asymmetry of the Hessian or the residual of the vector,
+        cm⁻¹. NaN for zero modes
+    vector : ndarray
+        Unit vectors (k, d) in rows
+    translation : ndarray
+        Translational fraction (k,) of the kinetic energy. The rest is librational
+    weight : ndarray
+        Fraction (k, n) of the kinetic energy in each molecule
+    intensity : ndarray
+        Infrared intensity (k,) by the dipole of the charges, km/mol (at the Gamma point for a unit
+        cell)
+    total : int
+        Number of all modes, at the Gamma point those of a unit cell
+    cells : int
+        Number of unit cells, if these are modes at the Gamma point
+    """
 
     system: System
-    coordinates: Coordinates  # about the minimum, which is `coordinates.state`
-    energy: float  # of the minimum, kJ/mol
-    force: float  # largest at the minimum, kJ/(mol Å)
-    torque: float  # largest at the minimum, kJ/mol
-    ended: str  # why the minimisation stopped before the rounding of forces, if it did
-    temperature: float  # of the scene, K; 0 if it has none
-    # 2/w of the last mode; if all were computed, the longest stable step of velocity Verlet
+    coordinates: Coordinates
+    energy: float
+    force: float
+    torque: float
+    ended: str
+    temperature: float
     longest_step_fs: float
-    number: np.ndarray  # (k,) of each mode among all d, from 1
-    rate: np.ndarray  # (k,) w, rad/ps; 0 of zero modes, negative of unstable modes
-    wavenumber: np.ndarray  # (k,) w/(2 pi c), cm⁻¹
-    # (k,) cm⁻¹, by the asymmetry of the Hessian or the residual of the vector; NaN of zero modes
+    number: np.ndarray
+    rate: np.ndarray
+    wavenumber: np.ndarray
     error: np.ndarray
-    # (k, d) unit vectors, rows; columns are the mass-weighted coordinates of `Coordinates`
     vector: np.ndarray
-    # (k,) translational fraction of the kinetic energy. The rest is librational
     translation: np.ndarray
-    weight: np.ndarray  # (k, n) fraction of the kinetic energy in each molecule
-    # (k,) infrared, km/mol (of a unit cell at the Gamma point), by the dipole of the charges
+    weight: np.ndarray
     intensity: np.ndarray
-    total: int  # number of all modes; at the Gamma point those of a unit cell
-    cells: int = 0  # number of unit cells, if these are modes at the Gamma point
+    total: int
+    cells: int = 0
 
     def free_energy(self, temperature: float, quantum: bool = True) -> float:
-        """Helmholtz energy (kJ/mol) of the rigid-molecule vibrations at a temperature (K), relative
-        to the energy of the minimum. At 0 the zero-point energy. Raises ValueError if there are
-        only some of the modes."""
+        """Helmholtz energy of the rigid-molecule vibrations, relative to the energy of the minimum.
+
+        Parameters
+        ----------
+        temperature : float
+            Temperature, K. At 0 the result is the zero-point energy
+        quantum : bool, optional
+            Whether the oscillators are quantum or classical
+
+        Returns
+        -------
+        float
+            Helmholtz energy, kJ/mol
+
+        Raises
+        ------
+        ValueError
+            If there are only some of the modes.
+        """
         if len(self.rate) < len(self.coordinates.index):
             raise ValueError("a sum over all modes needs all of them: leave out count and gamma")
         quanta = HBAR * self.rate[self.rate > 0]
@@ -169,6 +222,18 @@ class NormalModes:
         return float(terms.sum() / KJ_PER_MOL)
 
     def kind(self, k: int) -> str:
+        """The kind of a mode.
+
+        Parameters
+        ----------
+        k : int
+            Index of the mode, from 0
+
+        Returns
+        -------
+        str
+            "zero", "translation" or "libration"
+        """
         return (
             "zero"
             if self.rate[k] == 0
@@ -178,11 +243,28 @@ class NormalModes:
         )
 
     def is_vibration(self, number: int) -> bool:
-        """Whether the mode of this number was computed and has a frequency."""
+        """Whether a mode was computed and has a frequency.
+
+        Parameters
+        ----------
+        number : int
+            Number of the mode among all, from 1
+
+        Returns
+        -------
+        bool
+            True if it has a frequency
+        """
         return bool(self.rate[self.number == number].any())
 
     def table(self) -> ReportTable:
-        """The modes with their properties. Zero modes, which mix freely, have none."""
+        """The modes with their properties. Zero modes, which mix freely, have none.
+
+        Returns
+        -------
+        ReportTable
+            A line for each mode. Its `text()` is for a terminal
+        """
 
         def of(values: np.ndarray) -> Callable[[int], float | None]:
             return lambda k: float(values[k]) if self.rate[k] else None
@@ -222,17 +304,24 @@ def normal_modes(
 
     Parameters
     ----------
-    minimise
+    scene : Scene or Simulation
+        Molecules at their start, or at their present state
+    minimise : bool, optional
         False requires that the start is a minimum
-    count
-        Of the lowest and of the highest modes, by Lanczos. Default: all, or 20 if there are more
-        than 6000
-    gamma
+    count : int, optional
+        Number of the lowest and of the highest modes, by Lanczos. Default: all, or 20 if there are
+        more than 6000
+    gamma : bool, optional
         Only modes with the period of the unit cell that `structure.repeat` repeats (k = 0)
-    required
+    required : int, optional
         Number of a mode that has to be computed, which is checked before computing
-    progress
+    progress : callable, optional
         Called with the fraction done
+
+    Returns
+    -------
+    NormalModes
+        The modes by ascending frequency
 
     Raises
     ------

@@ -29,6 +29,16 @@ def read_run(folder: str | Path) -> Results | Table:
     `notes` and an empty `stages`, its state is the one of the last checkpoint. A sweep gives the
     `Table` that `rigidmd.sweep` returned, with the points that have finished.
 
+    Parameters
+    ----------
+    folder : str or Path
+        Folder of the run or sweep
+
+    Returns
+    -------
+    Results or Table
+        The results of a run, or the table of a sweep
+
     Raises
     ------
     OutputError

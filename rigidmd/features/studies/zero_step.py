@@ -39,14 +39,10 @@ def zero_step(
 
     Parameters
     ----------
-    curves
+    curves : bool, optional
         Whether g(r) is corrected too, if the run has frames
-    axis
-        Axis of a density profile that is corrected too
-
-    Raises
-    ------
-    OutputError
+    axis : {"x", "y", "z"}, optional
+        Axis of a density profile that is corrected too. Default: none
     """
     found = [_of_run(run) for run in runs.members]
     names = [name for name in found[0] if all(name in of_run for of_run in found)]

@@ -16,3 +16,7 @@ def __getattr__(name: str) -> object:
     if name not in __all__:
         raise AttributeError(f"module 'rigidmd.view' has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{'plots' if name == 'plot' else 'notebook'}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

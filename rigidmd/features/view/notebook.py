@@ -120,6 +120,16 @@ class AnimationPage:
 def show(results: Results) -> AnimationPage:
     """The animation of a run in a notebook, on a small page with the plots.
 
+    Parameters
+    ----------
+    results : Results
+        Results of a run with a trajectory
+
+    Returns
+    -------
+    AnimationPage
+        The page, which a notebook displays
+
     Raises
     ------
     ImportError

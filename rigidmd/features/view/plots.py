@@ -62,12 +62,26 @@ def plot(results: Results, *columns: str, log: bool = False) -> Picture:
 
     Parameters
     ----------
-    columns
+    results : Results
+        Results of a run
+    *columns : str
         Names of columns, drawn against time, with one panel for each unit. Default: the main figure
         of the run (energy.png, or the path of the axis of a body), or the name of another figure of
         a body ("angles", "ellipsoids", "path", "invariants")
-    log
-        Absolute values on a logarithmic axis. Raises KeyError
+    log : bool, optional
+        Absolute values on a logarithmic axis
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        The figure
+
+    Raises
+    ------
+    KeyError
+        For an unknown column.
+    ValueError
+        With too few samples.
     """
     figures = {}
     if not set(columns[:1]) & set(results.units):
@@ -121,16 +135,16 @@ TIME_FRACTION = 0.2
 
 
 class LivePlot(Observer):
-    """Draws columns of the samples so far in the output of a notebook cell. Elsewhere it does
-    nothing.
+    """Draws columns of the samples so far in the output of a notebook cell. It has no effect
+    elsewhere.
 
     Parameters
     ----------
-    columns
-        names, as in `results[...]`. Default: temperature and drift, for a body energy_error
-    interval
-        Of the run (ps, s for a body) between two drawings. Default: the interval of its samples
-    pause
+    *columns : str
+        Names, as in `results[...]`. Default: temperature and drift, for a body energy_error
+    interval : float, optional
+        Time of the run between two drawings, ps, for a body s. Default: the interval of its samples
+    pause : float, optional
         Least seconds between two drawings, which take at most a fifth of the time
     """
 
@@ -143,6 +157,11 @@ class LivePlot(Observer):
 
     def begin(self, run: Simulation) -> None:
         """Prepare the drawing.
+
+        Parameters
+        ----------
+        run : Simulation
+            The simulation that starts
 
         Raises
         ------

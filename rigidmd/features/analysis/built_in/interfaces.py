@@ -170,7 +170,12 @@ def interfaces(runs: Runs, axis: Axis = "z") -> AnalysisResult:
     to the profile about the middle of the slab, averaged over both sides (Rowlinson & Widom 1982).
     In a mixture also densities and mole fractions of each species in both phases. Errors of one run
     are from the correlated series of what each frame changes in the fit. The curve also has the
-    mean cosine of dipoles with the outward normal. Raises OutputError.
+    mean cosine of dipoles with the outward normal.
+
+    Parameters
+    ----------
+    axis : {"z", "x", "y"}, optional
+        Normal of the slab
     """
     profiles = profiles_of(runs, axis)
     densities = profiles.densities
@@ -275,7 +280,13 @@ def _mean_cosine(runs: Runs, profiles: Profiles, kind: Kind) -> np.ndarray:
 def surface_tension(runs: Runs, axis: Axis = "z") -> AnalysisResult:
     """Surface tension (mN/m) of the two interfaces of a slab: L/2 <P_N - P_T> (Kirkwood & Buff
     1949), with the edge L and the pressure P_N along the normal, and the mean pressure P_T across
-    it. Raises OutputError."""
+    it.
+
+    Parameters
+    ----------
+    axis : {"z", "x", "y"}, optional
+        Normal of the slab
+    """
     profiles = profiles_of(runs, axis)
     density = runs.mean([densities.mean(axis=0) for densities in profiles.densities])
     fitted(profiles.z, density, profiles.height)  # raises without a slab

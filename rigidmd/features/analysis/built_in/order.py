@@ -31,18 +31,14 @@ def nematic(runs: Runs, axis: Literal["", "x", "y", "z"] = "") -> AnalysisResult
     director, its eigenvector.
 
     The mean over frames of S, whose director may rotate, and S about the director of all frames. S
-    is 1 for parallel axes; that of a frame of N molecules without order is 0.80/sqrt(N), not 0. The
+    is 1 for parallel axes. For a frame of N molecules without order it is 0.80/sqrt(N), not 0. The
     middle eigenvalue times -2 has the mean 0 then (Eppenga & Frenkel 1984, Mol. Phys. 52, 1303).
 
     Parameters
     ----------
-    axis
-        In the coordinates of the models' files; default: the axis of linear molecules, and of
+    axis : {"x", "y", "z"}, optional
+        Axis in the coordinates of the models' files. Default: the axis of linear molecules, and of
         the potentials of two bodies
-
-    Raises
-    ------
-    OutputError
     """
     result = AnalysisResult("nematic", "nematic order")
     for kind in runs.moving:

@@ -62,8 +62,7 @@ def orientation(runs: Runs) -> AnalysisResult:
 
     Axes are those of `rigidmd models NAME`, ascending in inertia. A linear molecule has one.
     Rotational diffusion is the slope of the mean squared rotation about an axis of the body, summed
-    over frames. Raises OutputError.
-    """
+    over frames."""
     if not (kinds := [kind for kind in runs.moving if kind.molecule.degrees_of_freedom > 3]):
         raise OutputError("no molecule of this run rotates")
     interval, lags = interval_and_lags(runs, "an orientational correlation")
@@ -190,9 +189,10 @@ def _rotational_diffusion(runs: Runs, kind: Kind, interval: float, lags: int) ->
 )
 def spectrum(runs: Runs) -> AnalysisResult:
     """Densities of states (cm) for translation and for rotation about each body axis, from the
-    power of velocities and angular velocities, and their correlation functions. The integral over
-    wave numbers is a molecule's number of degrees of freedom. Needs frames with velocities, every
-    few fs. Raises OutputError."""
+    power of velocities and angular velocities, and their correlation functions.
+
+    The integral over wave numbers is a molecule's number of degrees of freedom. Needs frames with
+    velocities, every few fs."""
     interval, lags = interval_and_lags(runs, "a spectrum")
     size = min(runs.frame_count // BLOCKS, runs.shortest)
     result = AnalysisResult("spectrum", "densities of states")
@@ -325,8 +325,7 @@ def dielectric(runs: Runs) -> AnalysisResult:
 
     The mean dipole is 0 by symmetry, and is not subtracted: its square in a run of length T would
     take the fraction 2 tau/T of the fluctuation. Where something breaks the symmetry, it is
-    subtracted and that fraction is added. Raises OutputError.
-    """
+    subtracted and that fraction is added."""
     around = _permittivity_around(runs)
     dipoles = [total_dipole(run) for run in runs.members]
     if not any(kind.molecule.has_dipole for kind in runs.kinds):

@@ -60,23 +60,20 @@ def rdf(
     largest: Annotated[float, LENGTHS] | None = None,
     width: Annotated[float, LENGTHS] = WIDTH,
 ) -> AnalysisResult:
-    """g(r) of two sites, elements or species (centres of mass). Default: all pairs of elements, in
-    mixtures of species.
+    """g(r) of two sites, elements or species (centres of mass).
 
     g is normalised by the number of pairs of different molecules, so it tends to 1 in a small box
     too. Each frame has its own cell.
 
     Parameters
     ----------
-    largest
+    first, second : str, optional
+        Names of sites, elements or species. Default: all pairs of elements, in mixtures of species
+    largest : float, optional
         Largest distance, Å. Default: half the box, at most 10 Å
-    width
+    width : float, optional
         Width of a bin, Å. Wide bins lower a narrow peak, which the error of its height does not
         include
-
-    Raises
-    ------
-    OutputError
     """
     half = 0.5 * float(min(heights(cell).min() for run in runs.members for cell in run.cell))
     largest = min(half, LARGEST) if largest is None else largest
@@ -292,14 +289,10 @@ def structure_factor(
 
     Parameters
     ----------
-    name
+    name : str, optional
         A site, an element or a species. Default: the centres of all molecules
-    largest
+    largest : float, optional
         Largest wave vector, 1/Å
-
-    Raises
-    ------
-    OutputError
     """
     thinned, notes = _thinned(runs, ENOUGH_MOLECULES_K)
     reciprocal = 2 * np.pi * np.linalg.inv(thinned.mean_cell).T
@@ -378,8 +371,15 @@ def _k_vectors(reciprocal: np.ndarray, largest: float) -> tuple[np.ndarray, np.n
 
 @built_in("profile of the density along an axis of the box", position=30, needs=(trajectory, box))
 def density_profile(runs: Runs, axis: Axis = "z", bins: Count = 100) -> AnalysisResult:
-    """Mass density (g/cm³) of each species along an edge of the box: x, y or z for a, b or c.
-    Raises OutputError."""
+    """Mass density (g/cm³) of each species along an edge of the box.
+
+    Parameters
+    ----------
+    axis : {"z", "x", "y"}, optional
+        The edge c, a or b
+    bins : int, optional
+        Number of bins along the edge
+    """
     k = "xyz".index(axis)
     height = float(
         runs.mean([np.mean([heights(cell)[k] for cell in run.cell]) for run in runs.members])
@@ -416,9 +416,16 @@ def hydrogen_bonds(
     distance: Annotated[float, Limits(0.1, 20)] = BOND_DISTANCE,
     angle: Annotated[float, Limits(0.1, 180)] = BOND_ANGLE,
 ) -> AnalysisResult:
-    """Mean number of hydrogen bonds of a molecule, as donor and acceptor: heavy sites (N, O, F)
-    closer than `distance` (Å), with an angle to the bond of the hydrogen below `angle` (degrees).
-    Raises OutputError."""
+    """Mean number of hydrogen bonds of a molecule, as donor and acceptor, between heavy sites (N,
+    O, F).
+
+    Parameters
+    ----------
+    distance : float, optional
+        Largest distance of the heavy sites, Å
+    angle : float, optional
+        Largest angle between their line and the bond of the hydrogen, degrees
+    """
     if not any(_donors(kind.molecule) for kind in runs.kinds):
         why = "no molecule has a hydrogen bonded to nitrogen, oxygen or fluorine"
         raise OutputError(f"{why}: there are no hydrogen bonds")

@@ -173,8 +173,7 @@ def response(runs: Runs) -> AnalysisResult:
     alpha_p.
 
     Heat capacities are classical. The error of one run is from the series of what each sample
-    changes in a value to first order. Raises OutputError.
-    """
+    changes in a value to first order."""
     _check_conditions(runs)
     samples = Samples(runs)
     values = samples.responses(samples.mean_of_all)

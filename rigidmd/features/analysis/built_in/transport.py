@@ -89,9 +89,10 @@ def interval_and_lags(runs: Runs, what: str) -> tuple[float, int]:
     "mean squared displacement of the centres of mass", position=50, needs=(trajectory, motion)
 )
 def msd(runs: Runs) -> AnalysisResult:
-    """Mean squared displacement (Å²) of each species against time, all origins, up to a tenth
-    of the frames. Paths continue through the faces of the box, without the scaling by a barostat.
-    Raises OutputError."""
+    """Mean squared displacement (Å²) of each species against time, all origins, up to a tenth of
+    the frames.
+
+    Paths continue through the faces of the box, without the scaling by a barostat."""
     interval, lags = interval_and_lags(runs, "a mean squared displacement")
     curve = Curve(
         "msd", ("Time (ps)", interval * np.arange(lags)), "MSD (Å²)", {}, log=(True, True)
@@ -142,12 +143,9 @@ def diffusion(
 
     Parameters
     ----------
-    viscosity_mPa_s
-        For the correction of Yeh and Hummer. Default: from the pressure tensor of the run, if any
-
-    Raises
-    ------
-    OutputError
+    viscosity_mPa_s : float, optional
+        Viscosity for the correction of Yeh and Hummer, mPa s. Default: from the pressure tensor of
+        the run, if any
     """
     interval, lags = interval_and_lags(runs, "a diffusion coefficient")
     first = max(1, int((lags - 1) * FIT_FROM / FIT_TO))
@@ -244,8 +242,7 @@ def viscosity(runs: Runs) -> AnalysisResult:
 
     The integral is half the spectral density at frequency 0, from a fit of relaxations to the
     periodogram (`features.analysis.relaxation`). It has no time at which it would be cut off. The
-    error follows from the likelihood and from the choice of the model. Raises OutputError.
-    """
+    error follows from the likelihood and from the choice of the model."""
     stresses = [_stresses(run) for run in runs.members]
     interval = _interval_of(runs)
     length = interval * sum(map(len, stresses))

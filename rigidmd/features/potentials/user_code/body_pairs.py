@@ -62,49 +62,58 @@ def body_pair_potential(
     """An energy of pairs of bodies as a function of their relative position and orientations, for
     `Simulation(scene, forces=[...])`.
 
-    def dipoles(r, u, v):
-        s = np.sqrt(r @ r)
-        return 20 * (u @ v / s**3 - 3 * (u @ r) * (v @ r) / s**5)
-
-    rigidmd.body_pair_potential(dipoles, axis="z")
+    The function is function(r, a, b) or function(r, a, b, p, q). r is the vector (3,) in Å between
+    the reference points, from the first body to the second. a and b are their rotation matrices (3,
+    3) from the coordinates of the models' files to the lab, p and q their parameters. It gives the
+    energy in kJ/mol. Force and torques are derived from it, so that it may have arithmetic and
+    functions of NumPy such as numpy.exp and numpy.where, but no branches. Or it gives a tuple of
+    the energy, the force (3,) on the second body in kJ/mol/Å, and the torques (3,) on the first and
+    on the second body in kJ/mol, along the axes of the lab. An exchange of both bodies must not
+    change the energy. If their species differ, the one that is first in the scene is a.
 
     Parameters
     ----------
-    function
-        function(r, a, b) or function(r, a, b, p, q). r is the vector (3,) in Å between the
-        reference points, from the first body to the second. a and b are their rotation matrices
-        (3, 3) from the coordinates of the models' files to the lab, p and q their parameters. It
-        gives the energy in kJ/mol. Force and torques are derived from it, so that it may have
-        arithmetic and functions of NumPy such as numpy.exp and numpy.where, but no branches. Or it
-        gives a tuple of the energy, the force (3,) on the second body in kJ/mol/Å, and the torques
-        (3,) on the first and on the second body in kJ/mol, along the axes of the lab. An exchange
-        of both bodies must not change the energy. If their species differ, the one that is first in
-        the scene is a. Or it is the path of a table of linear bodies, an .npz file with the arrays
-        r_A, theta_1_deg, theta_2_deg, phi_deg and energy_kJ_mol
-    parameters
+    function : callable, str or Path
+        The energy, or the path of a table of linear bodies, an .npz file with the arrays r_A,
+        theta_1_deg, theta_2_deg, phi_deg and energy_kJ_mol
+    parameters : dict of str to dict, optional
         Species -> numbers by name, the attributes of p and q. It acts on these species
-    species
-        Without `parameters`: the species that it acts on; default: all
-    pairs
+    species : tuple of str, optional
+        Without `parameters`, the species that it acts on. Default: all
+    pairs : dict, optional
         (species, species) -> parameters of the pair, in place of those of p and q
-    axis
+    axis : {"x", "y", "z"}, optional
         An axis of the models' files: a and b are then unit vectors (3,) along it
-    references
-        Species -> reference point in the coordinates of its model's file, Å; default: the centre of
-        mass
-    truncation
+    references : dict of str to tuple, optional
+        Species -> reference point (3,) in the coordinates of its model's file, Å. Default: the
+        centre of mass
+    truncation : {"switch", "plain"}, optional
         switch: from `switch_start_A` the energy is switched to 0 at the cutoff, with two continuous
-        derivatives; plain: it jumps
-    cutoff_A
-        Default: the cutoff of the scene
-    switch_start_A
-        Default: 0.9 of the cutoff
-    name
-        In the log and in messages; default: the name of the function
+        derivatives. plain: it jumps
+    cutoff_A : float, optional
+        Cutoff, Å. Default: the cutoff of the scene
+    switch_start_A : float, optional
+        Start of the switch, Å. Default: 0.9 of the cutoff
+    name : str, optional
+        Name in the log and in messages. Default: the name of the function
+
+    Returns
+    -------
+    BodyPairPotential
+        The potential
 
     Raises
     ------
     ValueError
+        For arguments that contradict each other.
+
+    Examples
+    --------
+        def dipoles(r, u, v):
+            s = np.sqrt(r @ r)
+            return 20 * (u @ v / s**3 - 3 * (u @ r) * (v @ r) / s**5)
+
+        rigidmd.body_pair_potential(dipoles, axis="z")
     """
     if isinstance(function, str | Path):
         from rigidmd.features.potentials.poses.table import read_body_table

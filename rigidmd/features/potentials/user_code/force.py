@@ -47,19 +47,19 @@ class Force(UserForce):
     """A force on molecules in plain Python: derive a class from it and define `on_sites` or
     `on_molecules`.
 
-    It is called once for every new set of positions, between steps of the compiled loop; a
+    It is called once for every new set of positions, between steps of the compiled loop. A
     `compiled_force` is faster.
 
-    Parameters
+    Attributes
     ----------
-    name
-        In logs and messages. Default: the name of the class
-    changes_momentum
+    name : str or None
+        Name in logs and messages. Default: the name of the class
+    changes_momentum : sequence of bool
         Which components of the total momentum it may change. False for forces between molecules
-    absolute_positions
+    absolute_positions : bool
         Whether its energy depends on absolute positions, which excludes a barostat. If False, its
         virial must be the last of the returned values
-    energy_noise
+    energy_noise : float
         Random error of its energies, kJ/mol, for the comparison with its forces at the start of a
         run
 
@@ -76,23 +76,46 @@ class Force(UserForce):
     energy_noise: ClassVar[float] = 0.0
 
     def begin(self, system: System) -> None:
-        """Called once with the system, which has `sites` (names, elements, masses, charges),
-        `species` and `model`."""
+        """Called once before the first forces.
+
+        Parameters
+        ----------
+        system : System
+            Has `sites` (names, elements, masses, charges), `species` and `model`
+        """
 
     def on_sites(self, position: np.ndarray, state: State) -> tuple:
-        """(energy in kJ/mol, forces (s, 3) on all sites in kJ/mol/Å) at their positions (s, 3), Å,
-        not wrapped.
+        """Energy and forces on all sites.
 
-        Sites are those of `system.sites`, in its order. A third value is the molecular virial (3,
-        3), kJ/mol.
+        Parameters
+        ----------
+        position : ndarray
+            Positions (s, 3) of the sites of `system.sites`, in its order, lab frame, Å, not wrapped
+        state : State
+            The state of the molecules
+
+        Returns
+        -------
+        tuple
+            Energy in kJ/mol, forces (s, 3) in kJ/mol/Å and, optionally, the molecular virial (3, 3)
+            in kJ/mol
         """
         raise NotImplementedError
 
     def on_molecules(self, state: State) -> tuple:
-        """(energy in kJ/mol, forces (n, 3) on centres of mass in kJ/mol/Å, torques (n, 3) in
-        kJ/mol, body frame).
+        """Energy, forces and torques on molecules.
 
-        Torques may be omitted. A fourth value is the molecular virial (3, 3), kJ/mol.
+        Parameters
+        ----------
+        state : State
+            The state of the n molecules
+
+        Returns
+        -------
+        tuple
+            Energy in kJ/mol, forces (n, 3) on centres of mass in kJ/mol/Å, lab frame, torques (n,
+            3) in kJ/mol, body frame, and the molecular virial (3, 3) in kJ/mol. Torques and virial
+            may be omitted
         """
         raise NotImplementedError
 

@@ -32,15 +32,30 @@ Function = TypeVar("Function", bound=Callable[..., object])
 def compiled_force(kind: type) -> Callable[[Function], Function]:
     """Make a NamedTuple class a force that is compiled into the step loop.
 
-    The function adds forces (lab frame, u Å/ps²) and torques (body frame, u Å²/ps²) to `load` and,
-    unless `tally` is None, its energy (u Å²/ps², 100 of them are 1 kJ/mol) and molecular virial,
-    sum of F (x) R in rows, to `tally`.
+    The decorated function adds forces (lab frame, u Å/ps²) and torques (body frame, u Å²/ps²) to
+    `load` and, unless `tally` is None, its energy (u Å²/ps², 100 of them are 1 kJ/mol) and
+    molecular virial, sum of F (x) R in rows, to `tally`.
 
     The class may have the attribute `changes_momentum`, three booleans: whether the force may
     change each component of the total momentum (the default), so False for forces between
     molecules. `absolute_positions = True` means that the energy depends on positions in the lab,
     which excludes a barostat. The class may hold numbers, arrays and tuples of them. If its numbers
     come from the system, give `Simulation` an object with a method `term(system)` that makes it.
+
+    Parameters
+    ----------
+    kind : type
+        The NamedTuple class
+
+    Returns
+    -------
+    callable
+        A decorator of a function of (term, state, load, tally)
+
+    Raises
+    ------
+    TypeError
+        For another class, or a function with other arguments.
 
     Examples
     --------
@@ -81,25 +96,33 @@ class ThermostatDefaults:
 def compiled_thermostat(kind: type) -> Callable[[Function], Function]:
     """Make a NamedTuple class a thermostat: a flow on the momenta.
 
-    The function changes `state.velocity` and `state.angular_momentum_body` over a time h (ps), and
-    adds the change of the kinetic energy to `state.energy_ledger[0]`, so that energy less heat is
-    conserved. With "baoab", the default in nvt and npt, it acts in the middle of each step. With
-    other integrators half before and half after each step (`halved = False` in the class: all of it
-    after the step).
+    The decorated function has the arguments thermostat, model, state, h and draw. It changes
+    `state.velocity` and `state.angular_momentum_body` over a time h (ps), and adds the change of
+    the kinetic energy to `state.energy_ledger[0]`, so that energy less heat is conserved. With
+    "baoab", the default in nvt and npt, it acts in the middle of each step. With other integrators
+    half before and half after each step (`halved = False` in the class: all of it after the step).
 
-    `changes_momentum = True` in the class means that it changes the total momentum.
+    `model` is a `rigidmd.dynamics.model.Model`. Masses and moments are by species,
+    `model.mass[model.species[m]]`. `draw` is an integer, the first of the random numbers of this
+    call. `rigidmd.dynamics.noise` has `normals(thermostat.key, draw, m, state.step[0])`, two normal
+    numbers for molecule m. Draw + 1, ... gives more. The key is a field of the class, from
+    `key_of(seed, THERMOSTAT, stage)`. `changes_momentum = True` in the class means that it changes
+    the total momentum.
 
     Parameters
     ----------
-    model
-        `rigidmd.dynamics.model.Model`. Masses and moments are by species,
-        `model.mass[model.species[m]]`
-    state
-        `rigidmd.core.state.State`
-    draw
-        An integer, the first of the random numbers of this call. `rigidmd.dynamics.noise` has
-        `normals(thermostat.key, draw, m, state.step[0])`, two normal numbers for molecule m. Draw +
-        1, ... gives more. The key is a field of the class, from `key_of(seed, THERMOSTAT, stage)`
+    kind : type
+        The NamedTuple class
+
+    Returns
+    -------
+    callable
+        A decorator of a function of (thermostat, model, state, h, draw)
+
+    Raises
+    ------
+    TypeError
+        For another class, or a function with other arguments.
 
     Examples
     --------

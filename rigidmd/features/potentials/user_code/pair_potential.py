@@ -32,12 +32,36 @@ DEFAULT_NAME = "pair_potential"
 
 @dataclass(frozen=True)
 class PairPotential(UserForce):
-    """A pair potential for `Simulation(scene, forces=[...])`, made by `pair_potential`."""
+    """A pair potential for `Simulation(scene, forces=[...])`, made by `pair_potential`.
+
+    Attributes
+    ----------
+    energy : str, callable or None
+        Energy as a function of the distance
+    table : Columns or None
+        Distances, energies and forces
+    constants : dict of str to float
+        Parameters that all sites have
+    of_sites : dict or None
+        Site -> parameters. None: from the models
+    sites : tuple of str
+        The only sites on which it acts. Empty for all
+    pairs : dict
+        (site, site) -> parameters of the pair
+    mixing : dict of str to str
+        Parameter -> mean for unlike sites
+    truncation : str or None
+        Cutoff scheme
+    cutoff_A, switch_start_A : float or None
+        Cutoff and start of the switch, Å
+    name : str
+        Name in the log and in messages
+    """
 
     energy: "str | Callable | None"
     table: Columns | None
     constants: Parameters
-    of_sites: Mapping[str, Parameters] | None  # None: from the models
+    of_sites: Mapping[str, Parameters] | None
     sites: tuple[str, ...]
     pairs: Mapping[tuple[str, str], Parameters]
     mixing: Mapping[str, Rule]
@@ -50,9 +74,20 @@ class PairPotential(UserForce):
     def formula(self, cutoff: float) -> Formula:
         """The formula that is compiled.
 
+        Parameters
+        ----------
+        cutoff : float
+            Cutoff, Å
+
+        Returns
+        -------
+        Formula
+            Energy and force as functions of the distance
+
         Raises
         ------
         PairPotentialError
+            If the energy cannot be compiled.
         """
         try:
             if self.table is not None:
@@ -82,35 +117,43 @@ def pair_potential(
 
     Parameters
     ----------
-    energy
+    energy : str or callable, optional
         The energy in kJ/mol of the distance r in Å and of named parameters, as a text: + - * / **
         and exp, log, sqrt, sin, cos. Its force is its derivative. Or a function f(p, r) that gives
         (energy, -dE/dr), where p has the parameters. It may also have the arguments r2 (r²) and
         inverse (1/r), and is compiled for vectors
-    parameters
+    parameters : dict, optional
         Site -> parameters of sites of this kind, named by site, SPECIES.SITE or element: a
         dictionary, or the NamedTuple that a function expects. Or plain numbers, the same for all
         sites. Default: `parameters` of the sites in the models' files
-    table
+    table : tuple of arrays, str or Path, optional
         Instead of an energy, distances in Å, energies in kJ/mol and perhaps forces -dE/dr in
         kJ/mol/Å, which a spline interpolates, or a file with these columns. Nearer than the first
         distance the energy rises as r⁻¹²
-    sites
+    sites : sequence of str, optional
         The only sites that it acts on
-    pairs
+    pairs : dict, optional
         (site, site) -> parameters of a pair, instead of mixed ones. Without `parameters`, it acts
         on them only
-    mixing
+    mixing : dict of str to str, optional
         Parameter -> "geometric", "arithmetic" or "harmonic", the mean for unlike sites. Default:
         arithmetic for names that begin with sig, else geometric
-    truncation, switch_start_A, cutoff_A
-        As in [forces] of the scene, which are the defaults
-    name
-        In the log and in messages
+    truncation : str, optional
+        As in [forces] of the scene, which is the default
+    cutoff_A, switch_start_A : float, optional
+        As in [forces] of the scene, Å. Default: as there
+    name : str, optional
+        Name in the log and in messages. Default: the name of the function
+
+    Returns
+    -------
+    PairPotential
+        The potential
 
     Raises
     ------
     ValueError
+        For arguments that contradict each other, or an energy that cannot be compiled.
 
     Examples
     --------

@@ -16,12 +16,20 @@ _TRUSTED: set[str] = set()
 
 
 def trust_file(path: str | Path) -> None:
-    """Allow scenes to run a Python file with these contents, at any path. The code can do anything
-    that you can do: read it before. On the command line, --trust FILE does the same.
+    """Allow scenes to run a Python file with these contents, at any path.
+
+    The code can do anything that you can do: read it before. On the command line, --trust FILE does
+    the same.
+
+    Parameters
+    ----------
+    path : str or Path
+        Path of the Python file
 
     Raises
     ------
     SceneError
+        If the file cannot be read.
     """
     _TRUSTED.add(digest_of(_source(Path(path), option("trust"))))
 

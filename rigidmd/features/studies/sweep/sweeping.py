@@ -149,15 +149,29 @@ def sweep(
 
     Parameters
     ----------
-    sets
+    scene : str or Path
+        Path of the scene file
+    sets : dict
         Dotted key -> list, tuple or range of values, or one value for all points. All combinations
         run
-    folder
-        default: runs/NAME-sweep. Points that have finished there are not run again
-    jobs, threads
-        Number of points that run at a time, and threads per point. Default: all cores have work
-    progress
+    folder : str or Path, optional
+        Folder of the sweep. Points that have finished there are not run again. Default:
+        runs/NAME-sweep
+    jobs : int, optional
+        Number of points that run at a time. Default: all cores have work
+    threads : int, optional
+        Number of threads of each point. Default: all cores have work
+    force : bool, optional
+        Replace the sweep in the folder
+    trust : sequence of str, optional
+        Python files that the scene may run, as `trust_file`
+    progress : bool, optional
         Whether to show progress, as `Simulation.run` does. Default: in notebooks
+
+    Returns
+    -------
+    Table
+        A row for each combination of values, columns of means and errors
 
     Raises
     ------

@@ -74,8 +74,24 @@ class Table(Displayed):
     """Results of a sweep: a row for each combination of values, columns of means and errors.
 
     table["Temperature (K)"] is a column of means as an array (rows,), table.error("Temperature
-    (K)") of their errors, table["seed"] of the values of a key. failed : point -> why it has no
-    results. runs : point that has finished -> folder of its run, for `rigidmd.read_run`
+    (K)") of their errors, table["seed"] of the values of a key.
+
+    Attributes
+    ----------
+    folder : Path
+        Folder of the sweep
+    keys : list of str
+        Dotted keys that vary
+    rows : list of SweepRow
+        Combinations of values with their results
+    columns : list of str
+        Headers of the columns of means
+    failed : dict of str to str
+        Point -> why it has no results
+    runs : dict of str to Path
+        Point that has finished -> folder of its run, for `rigidmd.read_run`
+    together : dict of str to list of str
+        Key -> the keys that vary together with it, itself included
     """
 
     folder: Path
@@ -101,8 +117,23 @@ class Table(Displayed):
         return self._measured(column)[:, 0]
 
     def error(self, column: str) -> np.ndarray:
-        """Standard errors of a column of means: over the runs of a row, or of its single run. NaN
-        without one."""
+        """Standard errors of a column of means: over the runs of a row, or of its single run.
+
+        Parameters
+        ----------
+        column : str
+            Header of the column
+
+        Returns
+        -------
+        ndarray
+            Errors (rows,). NaN where there is none
+
+        Raises
+        ------
+        KeyError
+            With all names.
+        """
         return self._measured(column)[:, 1]
 
     def _measured(self, column: str) -> np.ndarray:
@@ -112,10 +143,33 @@ class Table(Displayed):
         return np.array([row[column] for row in self.rows], float).reshape(-1, 2)
 
     def has_error(self, column: str) -> bool:
+        """Whether a column of means has errors.
+
+        Parameters
+        ----------
+        column : str
+            Header of the column
+
+        Returns
+        -------
+        bool
+            True if one of its rows has an error
+        """
         return bool(np.isfinite(self.error(column)).any())
 
     def to_dataframe(self) -> "pandas.DataFrame":
-        """The table of sweep.csv. Raises ImportError without pandas."""
+        """The table of sweep.csv.
+
+        Returns
+        -------
+        pandas.DataFrame
+            A line for each combination of values
+
+        Raises
+        ------
+        ImportError
+            Without pandas.
+        """
         try:
             import pandas
         except ImportError:
@@ -123,8 +177,13 @@ class Table(Displayed):
         return pandas.DataFrame(self.lines())
 
     def lines(self) -> list[dict[str, Cell]]:
-        """The lines of sweep.csv: values of keys, number of runs, and each column with its
-        error."""
+        """The lines of sweep.csv: values of keys, number of runs, and each column with its error.
+
+        Returns
+        -------
+        list of dict
+            Header -> cell, for each line
+        """
         with_error = {name for name in self.columns if self.has_error(name)}
         lines = []
         for row in self.rows:
@@ -139,7 +198,13 @@ class Table(Displayed):
 
     def brief(self) -> ReportTable:
         """The table that is printed and displayed: keys, number of runs, and the main columns with
-        their errors."""
+        their errors.
+
+        Returns
+        -------
+        ReportTable
+            Its `text()` is for a terminal
+        """
         short = short_keys(self.keys)
         headers = {key: f"set {readable_key(short[key])}" for key in self.keys}
         titles = main_titles()
@@ -156,7 +221,13 @@ class Table(Displayed):
 
     def main_columns(self) -> list[str]:
         """The columns that are printed and drawn: the main ones, and the densities of stages before
-        the last one."""
+        the last one.
+
+        Returns
+        -------
+        list of str
+            Headers of columns
+        """
         earlier = [column for column in self.columns if column.endswith(f": {DENSITY}")]
         more = [name for _, study in studies() for name in study.main_columns]
         return [name for name in (*main_titles(), *more) if name in self.columns] + earlier
