@@ -60,7 +60,7 @@ class Observation:
     def __getattr__(self, column: str) -> float:
         if column == "pressure_tensor_bar":
             warn_renamed(column, "pressure_tensor")
-            return self.pressure_tensor
+            return self.pressure_tensor  # pyright: ignore[reportReturnType]
         return getattr(self.sample, column)
 
     def __dir__(self) -> list[str]:

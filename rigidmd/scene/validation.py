@@ -74,8 +74,10 @@ OF_PYDANTIC = {*dir(BaseModel)} - OBJECT | {*vars(BaseModel)}
 class SectionKind(ModelMetaclass):
     """The class of sections, whose `dir` and `help` are short."""
 
+    _internal: tuple[str, ...]
+
     def __dir__(cls) -> list[str]:
-        return _without_internals(cls, super().__dir__())
+        return _for_users(super().__dir__(), cls._internal)
 
 
 class Section(BaseModel, metaclass=SectionKind):
@@ -85,7 +87,7 @@ class Section(BaseModel, metaclass=SectionKind):
     """Names that packages use and users do not"""
 
     def __dir__(self) -> list[str]:
-        return _without_internals(type(self), super().__dir__())
+        return _for_users(super().__dir__(), self._internal)
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", defer_build=True, json_schema_extra=_add_docstrings
@@ -102,9 +104,9 @@ class Section(BaseModel, metaclass=SectionKind):
         return ()
 
 
-def _without_internals(kind: type[Section], names: Iterable[str]) -> list[str]:
-    """The names of a section without those that users do not need."""
-    hidden = OF_PYDANTIC.union(kind._internal)
+def _for_users(names: Iterable[str], internal: Iterable[str]) -> list[str]:
+    """The names of a section that users need."""
+    hidden = OF_PYDANTIC.union(internal)
     return [name for name in names if name not in hidden and (name[:2] != "__" or name in OBJECT)]
 
 

@@ -12,7 +12,7 @@ from scipy.special import erfcinv
 from support.common import ROOT, small_scene
 from support.stops import stopped_at
 
-from rigidmd import Scene, Simulation, resolve
+from rigidmd import Scene, Simulation, with_defaults
 from rigidmd.assemble.build import build
 from rigidmd.assemble.harmonic import stable_angle, step_error
 from rigidmd.assemble.time_step import MARGIN, MIXED_ERROR, _one_digit, error_of_step, step_warnings
@@ -383,7 +383,7 @@ def test_a_droplet_in_a_large_box_has_the_accuracy_of_a_liquid(edge, printed):
         printed("energy", path, "--accuracy", "--json", "--set", f"box.lengths_A={edge}").out
     )["accuracy"]
     assert 1e-7 < found["in_e2_per_A2"] < 5e-5
-    scene = resolve(Scene.read(path, {"box.lengths_A": edge}))
+    scene = with_defaults(Scene.read(path, {"box.lengths_A": edge}))
     assert (
         max(scene.forces.pme_grid) <= 24
     )  # a spacing that the box would not allow at a cutoff of 14 Å
