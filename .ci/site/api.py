@@ -119,7 +119,7 @@ def _signature(member: object) -> str:
     ]
     arguments = [_without_modules(str(each)) for each in parameters]
     keywords = [k for k, each in enumerate(parameters) if each.kind == KEYWORD]
-    if keywords:
+    if keywords and "*" not in "".join(arguments[: keywords[0]]):
         arguments.insert(keywords[0], "*")
     end = "" if is_class else _returned(function, " -> ")
     line = f"({', '.join(arguments)}){end}"

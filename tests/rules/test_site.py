@@ -128,3 +128,4 @@ def test_the_reference_has_types_but_no_constructor_of_what_functions_return(sit
     assert "#### `Simulation.threads: int` {" in page
     assert "#### `Simulation.step(count: int = 1) -> int` {" in page
     assert ") -> Results`" in page
+    assert "### `plot(results: Results, *columns: str, log: bool = False) -> Picture` {" in page
