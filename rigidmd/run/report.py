@@ -249,8 +249,8 @@ def short_summary(
     cells = [[f"{k}", stage["name"], _how(stage)] for k, stage in enumerate(stages)]
     lines = ["", *_indented(cells)]
     if moving:
-        lines += ["", *_table(moving, described)]
-    notes = [note for stage in moving for note in _stage_notes(stage)]
+        lines += ["", *_indented(means_table(moving, described))]
+    notes = [note for stage in moving for note in stage_notes(stage)]
     notes += [note for note in summary["notes"] if note not in known]
     if summary["positions"] == "wrapped":
         notes.append("positions are wrapped into the box: displacements need unwrapped frames")
@@ -280,13 +280,13 @@ def _how(stage: dict) -> str:
     return how
 
 
-def _table(stages: list[dict], described: Mapping[str, Quantity]) -> list[str]:
-    """Means of stages: a column for each stage, then the unit."""
+def means_table(stages: list[dict], described: Mapping[str, Quantity]) -> list[list[str]]:
+    """A header and rows of the means of stages: a column for each stage, then the unit."""
     lines = [["", *(stage["name"] for stage in stages), ""]]
     for title, cells, unit in _table_rows(stages, described):
         if any(cell is not None for cell in cells):
             lines.append([title, *("-" if cell is None else cell for cell in cells), unit])
-    return _indented(lines)
+    return lines
 
 
 def _indented(cells: list[list[str]]) -> list[str]:
@@ -343,7 +343,7 @@ def _verdict(stage: dict, drift: Mean) -> str | None:
     return ", ".join([significance, *(words.split()[-1] for words in size)])
 
 
-def _stage_notes(stage: dict) -> list[str]:
+def stage_notes(stage: dict) -> list[str]:
     """Sentences on a stage that its numbers need."""
     notes = []
     name = stage["name"]

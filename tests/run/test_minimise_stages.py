@@ -384,7 +384,7 @@ def test_a_minimum_alone_has_one_frame(tmp_path):
     assert u.atoms.positions == pytest.approx(results.state.position, abs=6e-3)
     write_report(tmp_path / "out", tmp_path / "report.html")
     record = read_record(tmp_path / "out")
-    assert panels(record.system, record.columns) == []
+    assert panels(record) == []
     assert not moving(record.scene.stages, record.columns["stage"]).any()
 
 

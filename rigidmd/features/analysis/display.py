@@ -48,11 +48,13 @@ def page_part(record: Record) -> Iterator[str]:
             rows.append([*row(value), value.note])
         for curve in result.curves:
             svg = figure(curve_figure(curve), f"analysis-{curve.file}", curve.label)
-            caption = html.escape(f"{result.name}: {curve.label}")
-            figures.append(f"<figure>{svg}<figcaption>{caption}</figcaption></figure>")
+            caption = html.escape(result.title_of(curve))
+            figures.append(f"<figure><figcaption>{caption}</figcaption>{svg}</figure>")
     if phrases:
         text = html.escape("; ".join(dict.fromkeys(phrases)))
         yield f'<p class="faint">Values ± one standard error, of {text}.</p>'
     yield table(["", *HEADERS[1:], "note"], rows, words=True)
     yield f'<div class="plots">{"".join(figures)}</div>' if figures else ""
-    yield "<p>Skipped:</p>" + items(left_out) if left_out else ""
+    if left_out:
+        title = f"{len(left_out)} values without a result, and why"
+        yield f"<details><summary>{title}</summary>{items(left_out)}</details>"

@@ -17,7 +17,7 @@ from rigidmd.scene.validation import not_none
 
 if TYPE_CHECKING:
     from rigidmd.features.bodies.system import BodySystem
-    from rigidmd.features.view.figures.panels import Panel, Timeline
+    from rigidmd.features.view.figures.panels import TimedPanel, Timeline
     from rigidmd.features.view.figures.picture import Picture
     from rigidmd.run.record import Record
     from rigidmd.run.results import Results
@@ -35,8 +35,11 @@ class BodyDisplay(KindDisplay["BodySystem", Motion]):
     def timeline(self, system: "BodySystem", columns: Mapping[str, np.ndarray]) -> "Timeline":
         return timeline(columns)
 
-    def panels(self, system: "BodySystem", columns: Mapping[str, np.ndarray]) -> "list[Panel]":
-        return [panel for family in body_panels(system, columns).values() for panel in family]
+    def panels(
+        self, system: "BodySystem", columns: Mapping[str, np.ndarray], summary: Json
+    ) -> "list[TimedPanel]":
+        times, families = timeline(columns), body_panels(system, columns)
+        return [(times, panel) for family in families.values() for panel in family]
 
     def animation(self, record: "Record", most_frames: int | None = None) -> BodyAnimation:
         return BodyAnimation(record)

@@ -19,7 +19,16 @@ from rigidmd.features.view.figures.space import (
     globe,
     path_style,
 )
-from rigidmd.features.view.figures.style import COOL, FAINT, INK, WARM, new_figure, open_axis
+from rigidmd.features.view.figures.style import (
+    COOL,
+    FAINT,
+    INK,
+    TEXT,
+    TITLE,
+    WARM,
+    new_figure,
+    open_axis,
+)
 from rigidmd.mechanics.free_rotor import SplitRotor
 
 if TYPE_CHECKING:
@@ -27,11 +36,11 @@ if TYPE_CHECKING:
 
     from rigidmd.features.view.figures.picture import Picture
 
-#: Errors of exactly 0 are drawn at this value.
+#: Errors of exactly 0 are drawn at this value, whose tick is labelled 0.
 FLOOR = 1e-17
 #: Names of errors in legends.
 LABELS = {"L_lab_error": "L in the lab", "L_size_error": "|L|"}
-NOTE = {"loc": "left", "fontsize": 9, "color": FAINT}
+NOTE = {"loc": "left", "fontsize": TITLE, "color": FAINT}
 DASHED = (0, (5, 4))
 FIGURES = ("axis", "angles", "ellipsoids", "omega", "path", "invariants")
 #: Inches: width and height of pictures, and width of the curves next to them.
@@ -249,7 +258,7 @@ def _draw_plane(
     axis.locator_params(nbins=4)
     for line in (axis.xaxis, axis.yaxis):
         line.set_major_formatter("{x:.6g}")
-    open_axis(axis, labelsize=8)
+    open_axis(axis, labelsize=TEXT)
 
 
 def _enlargement(factor: float) -> str:
@@ -269,17 +278,17 @@ def body_panels(system: BodySystem, columns: Mapping[str, np.ndarray]) -> dict[s
         families["angles"] = _angle_panels(columns)
     if "omega_body_1" in columns:
         omega = [(f"ω{'₁₂₃'[k - 1]}", columns[f"omega_body_{k}"]) for k in (1, 2, 3)]
-        families["omega"] = [Panel("angular velocity in the body frame (rad/s)", omega)]
+        families["omega"] = [Panel("angular velocity in the body frame", omega, "rad/s")]
     if system.translates:
         position = np.stack([columns[key] for key in "xyz"])
         least = 1e-11 * np.ptp(position, axis=1).max() + 1e-13 * np.abs(position).max()
         families["position"] = [
-            Panel(f"{key} of the centre of mass (m)", [("", values)], least=least)
+            Panel(f"{key} of the centre of mass", [("", values)], "m", least=least)
             for key, values in zip("xyz", position, strict=True)
             if np.ptp(position) > 0
         ]
     energies = [(name, columns[name]) for name in ("kinetic", "potential", "energy")]
-    families["energy"] = [Panel("energies (J)", energies)]
+    families["energy"] = [Panel("energies", energies, "J")]
     errors = [
         (LABELS.get(name, name.removesuffix("_error")), np.abs(values))
         for name, values in columns.items()
@@ -292,9 +301,9 @@ def body_panels(system: BodySystem, columns: Mapping[str, np.ndarray]) -> dict[s
 def error_panel(errors: list[tuple[str, np.ndarray]]) -> Panel:
     """Relative errors of what is conserved, on a logarithmic axis."""
     rounding = float(np.finfo(float).eps)
-    title = f"relative errors (dotted: rounding, {rounding:.1e}; 0 is drawn at {FLOOR:.0e})"
+    title = f"relative errors (dotted: rounding, {rounding:.1e})"
     curves = [(label, np.maximum(error, FLOOR)) for label, error in errors]
-    return Panel(title, curves, log=True, level=rounding)
+    return Panel(title, curves, log=True, level=rounding, zero=FLOOR)
 
 
 def _angle_panels(columns: Mapping[str, np.ndarray]) -> list[Panel]:
@@ -309,12 +318,11 @@ def _angle_panels(columns: Mapping[str, np.ndarray]) -> list[Panel]:
     found = []
     for name, angle in zip("φθψ", (np.unwrap(phi), theta, np.unwrap(psi)), strict=True):
         degrees = np.degrees(angle)
-        unit, size = ("turns", 360) if np.ptp(degrees) > 360 else ("°", 1)
         change = angle_range(degrees)
         if name != "θ" and np.ptp(degrees) > 1e-5:
             first, last = np.round(degrees[[0, -1]], 6) + 0.0
-            change = f"from {first:.6g}° to {last:.6g}°, {(last - first) / 360:+.4g} turns"
-        found.append(Panel(f"{name} ({unit}), {change}", [("", degrees / size)], least=1e-5))
+            change = f"from {first:.6g}° to {last:.6g}°"
+        found.append(Panel(f"{name}, {change}", [("", degrees)], "degrees", least=1e-5))
     return found
 
 

@@ -17,7 +17,7 @@ from rigidmd.core.files import atomic_file
 from rigidmd.errors import OutputError
 from rigidmd.features.view.figures.panels import draw_rows
 from rigidmd.features.view.figures.style import COLORS, INK, WARM, new_figure
-from rigidmd.features.view.kind_display import display_of, panels, timeline
+from rigidmd.features.view.kind_display import display_of, panels
 from rigidmd.features.view.page import Animation
 from rigidmd.run.record import Record, read_record
 from rigidmd.scene.validation import not_none
@@ -34,8 +34,9 @@ RATE = {".mp4": 25, ".gif": 12.5}
 SECONDS = 10.0
 HEIGHT = {".mp4": 640, ".gif": 300}
 INCHES = 5.0
-#: Most panels next to an animation, size of its name and clock, colour of the cursor of panels.
-PANELS = 3
+#: Panels above one another next to an animation; inches of one of more of them, in two columns;
+#: size of its name and clock, colour of the cursor of panels.
+PANELS, PANEL_HEIGHT = 3, 1.8
 FONT = 13
 CURSOR = tuple(bytes.fromhex(WARM[1:]))
 #: Most frames of molecules that are read.
@@ -111,6 +112,12 @@ def _pixels(figure: "Picture") -> np.ndarray:
     return np.array(canvas.buffer_rgba())[..., :3]
 
 
+def within(axis: "Axes", time: float) -> bool:
+    """Whether an axis of times has this one: that of a stage has no others."""
+    left, right = axis.get_xlim()
+    return left <= time <= right
+
+
 def _frames(
     record: Record,
     animation: Animation,
@@ -122,7 +129,7 @@ def _frames(
 ) -> Iterator[np.ndarray]:
     """The pictures (h, w, 3) of an animation, with a name and a clock, next to plots."""
     dpi = pixels / INCHES
-    plots, cursors = _plots(record, dpi) if with_plots else (np.empty((pixels, 0, 3), "u1"), [])
+    plots, cursors = _plots(record, pixels) if with_plots else (np.empty((pixels, 0, 3), "u1"), [])
     figure = new_figure(INCHES, INCHES, layout=None, dpi=dpi)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     style = {"color": INK, "fontsize": FONT, "va": "top"}
@@ -133,7 +140,7 @@ def _frames(
         animation.draw(axes, time)
         clock.set_text(f"{time:.{digits}f} {record.time_unit}")
         beside = plots.copy()
-        for axis in cursors:
+        for axis in (axis for axis in cursors if within(axis, time)):
             x = int(axis.transData.transform((time, 0))[0])
             low, high = (pixels - int(end) for end in axis.bbox.intervaly)
             beside[high:low, x : x + 2] = CURSOR
@@ -141,13 +148,16 @@ def _frames(
         progress((k + 1) / len(times))
 
 
-def _plots(record: Record, dpi: float) -> "tuple[np.ndarray, list[Axes]]":
-    """A picture of the first plots of a run, and their axes."""
-    width = 2 * round(0.375 * INCHES * dpi) / dpi  # an even number of pixels
-    figure = new_figure(width, INCHES, layout=None, dpi=dpi)
-    times = timeline(record.system, record.columns)
-    rows = [[(times, panel)] for panel in panels(record.system, record.columns)[:PANELS]]
-    axes = draw_rows(figure, rows, (0.0, 0.05, width, INCHES - 0.1))
+def _plots(record: Record, pixels: int) -> "tuple[np.ndarray, list[Axes]]":
+    """A picture of all plots of a run with this height, and their axes."""
+    drawn = panels(record)
+    across = 1 if len(drawn) <= PANELS else 2
+    rows = [drawn[k : k + across] for k in range(0, len(drawn), across)]
+    height = max(INCHES, PANEL_HEIGHT * len(rows))
+    dpi = pixels / height
+    width = 2 * round(0.375 * INCHES * across * dpi) / dpi  # an even number of pixels
+    figure = new_figure(width, height, layout=None, dpi=dpi)
+    axes = draw_rows(figure, rows, (0.0, 0.05, width, height - 0.1))
     return _pixels(figure), axes
 
 

@@ -7,10 +7,11 @@ function rigidmdArray(text, kind) {
   const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
   return new kind(bytes.buffer);
 }
-// animation: {times, unit, show(time) -> nothing or a promise}
+// animation: {times, unit, begin, show(time) -> nothing or a promise}; begin: the time at which it starts
 function rigidmdPlayer(film) {
   const find = (name) => document.getElementById("film-" + name);
   const first = film.times[0], last = film.times[film.times.length - 1], span = last - first || 1;
+  const begin = Math.min(last, Math.max(first, film.begin ?? first));
   const slider = find("slider"), button = find("play"), speed = find("speed"), clock = find("clock");
   const digits = Math.max(0, Math.min(6, 3 - Math.floor(Math.log10(span))));
   let now = first, playing = false, before = 0, busy = false;
@@ -37,7 +38,10 @@ function rigidmdPlayer(film) {
       const box = figure.getBoundingClientRect(), x = (event.clientX - box.left) / box.width;
       set(from + ((x - left) / (right - left)) * (to - from));
     });
-    return (time) => { line.style.left = 100 * (left + ((time - from) / (to - from)) * (right - left)) + "%"; };
+    return (time) => {
+      line.hidden = time < from || time > to;
+      line.style.left = 100 * (left + ((time - from) / (to - from)) * (right - left)) + "%";
+    };
   });
   async function set(time) {
     now = Math.min(last, Math.max(first, time));
@@ -55,7 +59,7 @@ function rigidmdPlayer(film) {
     const step = before ? Math.min(0.2, (stamp - before) / 1000) : 0;
     before = stamp;
     let next = now + (step * span) / +speed.value;
-    if (next > last) next = first + ((next - last) % span);
+    if (next > last) next = begin + ((next - last) % (last - begin || 1));
     if (!busy) set(next); else now = next;
     requestAnimationFrame(tick);
   }
@@ -85,5 +89,5 @@ function rigidmdPlayer(film) {
   });
   window.rigidmd = { set, play, get time() { return now; }, get busy() { return busy; } };
   const asked = /[#&]t=([^&]+)/.exec(location.hash); // page.html#t=1.5 begins there
-  return set(asked ? +asked[1] || first : first);
+  return set(asked ? +asked[1] || first : begin);
 }

@@ -16,7 +16,7 @@ from rigidmd.scene import Scene
 if TYPE_CHECKING:
     from rigidmd.engines.samples import Samples
     from rigidmd.engines.system import System
-    from rigidmd.features.view.figures.panels import Panel, Timeline
+    from rigidmd.features.view.figures.panels import TimedPanel, Timeline
     from rigidmd.features.view.figures.picture import Picture
     from rigidmd.features.view.page import Animation
     from rigidmd.run.record import Record
@@ -49,8 +49,11 @@ class KindDisplay(ABC, Generic[SystemT, SamplesT]):
         """The times of samples."""
 
     @abstractmethod
-    def panels(self, system: SystemT, columns: Mapping[str, np.ndarray]) -> "list[Panel]":
-        """The panels of a run that its columns allow."""
+    def panels(
+        self, system: SystemT, columns: Mapping[str, np.ndarray], summary: Json
+    ) -> "list[TimedPanel]":
+        """The panels of a run that its columns allow. summary : empty of a run that has not
+        ended"""
 
     @abstractmethod
     def animation(self, record: "Record", most_frames: int | None = None) -> "Animation":
@@ -100,10 +103,12 @@ class MolecularDisplay(KindDisplay["System", "Samples"]):
 
         return molecular_timeline(system, columns)
 
-    def panels(self, system: "System", columns: Mapping[str, np.ndarray]) -> "list[Panel]":
+    def panels(
+        self, system: "System", columns: Mapping[str, np.ndarray], summary: Json
+    ) -> "list[TimedPanel]":
         from rigidmd.features.view.figures.panels import molecular_panels
 
-        return molecular_panels(system, columns)
+        return molecular_panels(system, columns, summary.get("stages", ()))
 
     def animation(self, record: "Record", most_frames: int | None = None) -> "Animation":
         from rigidmd.features.view.molecule_animation import MoleculeAnimation
@@ -147,9 +152,10 @@ def display_of(scene: Scene) -> KindDisplay:
     return cast(KindDisplay, kind_of(scene).adds_to("view") or MolecularDisplay())
 
 
-def panels(system: AnySystem, columns: Mapping[str, np.ndarray]) -> "list[Panel]":
+def panels(record: "Record") -> "list[TimedPanel]":
     """The panels of a run that its columns allow."""
-    return display_of(system.scene).panels(system, columns)
+    display = display_of(record.scene)
+    return display.panels(record.system, record.columns, record.summary or {})
 
 
 def timeline(system: AnySystem, columns: Mapping[str, np.ndarray]) -> "Timeline":

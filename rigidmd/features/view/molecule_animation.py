@@ -1,7 +1,6 @@
 """The animation of molecules: on a page by chemiscope, with 16-bit coordinates, and in files by
 Matplotlib."""
 
-import html
 from dataclasses import replace
 from importlib.resources import files
 from itertools import product
@@ -165,6 +164,12 @@ class MoleculeAnimation(Animation):
         haze = HAZE * far.clip(0, 1)[:, None]
         return colors * (1 - haze) + haze
 
+    def _begin_of_last_stage(self) -> float:
+        """The time of the first frame of the last stage."""
+        columns = self._record.columns
+        last = columns["time"][columns["stage"] == columns["stage"][-1]]
+        return float(self.time[min(np.searchsorted(self.time, last[0]), len(self.time) - 1)])
+
     def page_part(self) -> PagePart:
         """The animation by chemiscope. Raises OutputError."""
         code = chemiscope_script()
@@ -195,6 +200,7 @@ class MoleculeAnimation(Animation):
         scale = max(float(high - low), 1e-9) / (2 * LARGEST_INTEGER)
         data = {
             "time": frames.time.astype("<f8"),
+            "begin": self._begin_of_last_stage(),
             "positions": np.round((positions - low) / scale - LARGEST_INTEGER).astype("<i2"),
             "low": float(low),
             "scale": scale,
@@ -205,10 +211,8 @@ class MoleculeAnimation(Animation):
             "cells": None if frames.cells is None else frames.cells.reshape(-1, 9).astype("<f4"),
             "name": self._record.scene.name,
         }
-        count = np.bincount(molecules.model.species, minlength=len(molecules.species))
-        legend = ", ".join(f"{k} {m.name}" for k, m in zip(count, molecules.species, strict=True))
         scripts = [code, read_asset("film.js"), read_asset("molecules.js")]
-        return PagePart(PICTURE, html.escape(legend), USAGE, data, scripts)
+        return PagePart(PICTURE, "", USAGE, data, scripts)
 
 
 def frames_in_memory(results: Results, system: System, record: Record) -> Frames:

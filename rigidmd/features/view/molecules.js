@@ -51,7 +51,7 @@
   }
   let shown = 0;
   await rigidmdPlayer({
-    times, unit: "ps", length: 20,
+    times, unit: "ps", length: 20, begin: data.begin,
     show: async (time) => {
       const k = frame(time);
       if (k === shown) return;

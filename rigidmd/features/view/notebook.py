@@ -11,7 +11,7 @@ from rigidmd.errors import InputError, OutputError
 from rigidmd.features.view.kind_display import display_of
 from rigidmd.features.view.page import Raw, code, figure, items, notes, page, read_asset, table
 from rigidmd.features.view.plots import record_of
-from rigidmd.features.view.run_page import FILM_STYLE, animation_parts
+from rigidmd.features.view.run_page import FILM_STYLE, animation_parts, page_title
 from rigidmd.run.kind import describe, kind_of
 from rigidmd.run.results import Results
 from rigidmd.run.simulation import Simulation
@@ -144,4 +144,4 @@ def show(results: Results) -> AnimationPage:
     except OutputError as error:
         kind = ImportError if "chemiscope" in str(error) else ValueError
         raise kind(str(error)) from None
-    return AnimationPage(page(record.scene.name, animation_parts(record, animation), FILM_STYLE))
+    return AnimationPage(page(page_title(record), animation_parts(record, animation), FILM_STYLE))

@@ -31,8 +31,7 @@ def plots_part(record: Record) -> str:
     """All plots as HTML. Attributes for the animation: data-box, the ends of the axis as fractions
     of the figure (left, right, top, bottom), data-from and data-to, the limits of its times."""
     figures = []
-    times = timeline(record.system, record.columns)
-    for k, panel in enumerate(panels(record.system, record.columns)):
+    for k, (times, panel) in enumerate(panels(record)):
         figure = new_figure(WIDTH, HEIGHT, layout=None)
         (axis,) = draw_rows(figure, [[(times, panel)]], (0.0, 0.0, WIDTH, HEIGHT))
         svg = figure_part(figure, f"panel{k}", panel.title)
@@ -125,8 +124,8 @@ def columns_figure(
         labels = [name.removesuffix(f"_{unit}").replace("_", " ") for name in members]
         values = [record.columns[name] for name in members]
         curves = [(label, np.abs(y) if log else y) for label, y in zip(labels, values, strict=True)]
-        title = ", ".join(labels) + (f" ({unit})" if unit != "1" else "")
-        rows.append([(times, Panel(title, curves, log))])
+        axis = unit if unit != "1" else ""
+        rows.append([(times, Panel(", ".join(labels), curves, axis, log=log))])
     return stack(rows, record.scene.name)
 
 

@@ -53,25 +53,29 @@ ABOUT = {
 }
 
 
+def page_title(record: Record) -> str:
+    """The name of the scene, and what it has."""
+    return record.scene.in_short.partition(";")[0]
+
+
 def write_report(folder: Path, path: Path) -> tuple[Path, list[str]]:
     """Write the page of the run in a folder. Returns its path, and notes on missing data. Raises
     OutputError."""
     record = read_record(folder)
-    write_page(path, f"{record.scene.name}: a run of rigidmd", parts(record))
+    write_page(path, page_title(record), parts(record))
     return path, record.missing
 
 
 def parts(record: Record, animation: str = "") -> Iterator[str]:
-    """The parts of the page, as HTML. animation : HTML with the plots"""
+    """The parts of the page, as HTML. animation : HTML with the results and plots"""
     kind = kind_of(record.scene)
     system = kind.build(record.scene, user_code=False)
     notes_of_run = (record.summary or {}).get("notes", ())
     warnings = [note for note in notes_of_run if note not in system.notes]
-    yield f'<p class="faint">{html.escape(record.scene.in_short)}</p>'
     yield notes([*record.missing, *warnings])
     yield animation
-    yield display_of(record.scene).results_section(record)
     if not animation:
+        yield display_of(record.scene).results_section(record)
         yield section("Plots", plots.plots_part(record))
     for feature in providers("page_parts"):
         for title, texts in feature.page_parts(record):
@@ -160,14 +164,14 @@ def write_view(folder: Path, path: Path) -> tuple[Path, list[str]]:
     OutputError."""
     record = read_record(folder)
     animation = display_of(record.scene).animation(record)
-    first, *others = animation_parts(record, animation)
-    title = f"{record.scene.name}: the animation of a run"
-    write_page(path, title, [*parts(record, first), *others], FILM_STYLE)
+    results = display_of(record.scene).results_section(record)
+    first, *others = animation_parts(record, animation, results)
+    write_page(path, page_title(record), [*parts(record, first), *others], FILM_STYLE)
     return path, [*record.missing, *animation.notes]
 
 
-def animation_parts(record: Record, animation: Animation) -> list[str]:
-    """The animation next to the plots, its data and its scripts, as HTML."""
+def animation_parts(record: Record, animation: Animation, results: str = "") -> list[str]:
+    """The animation next to the results (HTML) and the plots, its data and its scripts, as HTML."""
     part = animation.page_part()
 
     def packed(values: np.ndarray) -> str:
@@ -179,10 +183,12 @@ def animation_parts(record: Record, animation: Animation) -> list[str]:
     if any("</script" in text.lower() for text in part.scripts):
         raise ValueError("a script has the end tag of its element")
     data = data.replace("<", "\\u003c")
+    legend = f'<p class="legend">{part.legend}</p>' if part.legend else ""
     return [
         f'<div class="film"><div><div class="stage">{part.picture}{BAR}</div>'
-        f'<p class="legend">{part.legend}</p><p class="faint noprint">{part.usage}</p>'
-        f'<div class="faint">{items(animation.notes)}</div></div>{plots.plots_part(record)}</div>',
+        f'{legend}<p class="faint noprint">{part.usage}</p>'
+        f'<div class="faint">{items(animation.notes)}</div></div>'
+        f"<div>{results}{plots.plots_part(record)}</div></div>",
         f'<script type="application/json" id="film-data">{data}</script>',
         *(f"<script>{text}</script>" for text in part.scripts),
     ]

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rigidmd.features.view.page import table
+from rigidmd.features.view.page import Raw, items, table
 from rigidmd.run.record import Record
-from rigidmd.run.report import stage_rows, stage_title
+from rigidmd.run.report import SHOWN_STAGES, means_table, stage_notes, stage_title
 from rigidmd.run.summary import stage_summary
 
 
@@ -17,11 +17,24 @@ def stage_tables(record: Record) -> Iterator[str]:
     system = record.system
     samples = record.log
     known = (record.summary or {}).get("stages", ())
+    stages = []
     for row, k in enumerate(np.unique(samples["stage"]).tolist()):
         if not system.scene.stages[k].is_minimisation:
             ended = known[row] if row < len(known) else {}
             moves = ended.get("moves_tried", 0), ended.get("moves_accepted", 0)
             stage = stage_summary(system, samples, k, ended.get("computing_s", 0.0), moves)
-            yield f"<p>{html.escape(stage_title(stage))}</p>"
-            stage["choice"] = ended.get("choice")
-            yield table([], stage_rows(stage, system.quantities), words=True)
+            stages.append(stage | {"choice": ended.get("choice")})
+    shown = stages[-SHOWN_STAGES:]
+    yield "".join(f"<p>{html.escape(stage_title(stage))}</p>" for stage in stages)
+    if shown:
+        header, *rows = means_table(shown, system.quantities)
+        yield table(header, map(_unbroken, rows), words=True)
+        yield items(note for stage in shown for note in stage_notes(stage))
+
+
+def _unbroken(row: list[str]) -> list[str]:
+    """A row of the table whose numbers stay with their errors, and whose unit wraps between
+    words."""
+    title, *cells, unit = row
+    cells = [cell.replace(" ± ", "\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}") for cell in cells]
+    return [title, *cells, Raw(f'<span class="unit">{html.escape(unit)}</span>')]

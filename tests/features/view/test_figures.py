@@ -19,15 +19,16 @@ from rigidmd.core.quantities import QUANTITIES
 from rigidmd.engines.samples import Sample, Samples
 from rigidmd.features.analysis.curve_figure import curve_figure as drawn
 from rigidmd.features.analysis.result import Curve
+from rigidmd.features.bodies.figures import FLOOR, error_panel, timeline
 from rigidmd.features.bodies.trials import body_trial_system
-from rigidmd.features.studies.accuracy import accuracy
+from rigidmd.features.studies.accuracy.figure import accuracy_figure
 from rigidmd.features.studies.accuracy.measurement import IntegratorAccuracy
 from rigidmd.features.view.figures.energy import energy_figure
 from rigidmd.features.view.figures.panels import draw_panel
 from rigidmd.features.view.figures.picture import Picture
 from rigidmd.features.view.figures.space import AT_ONCE, draw_line
 from rigidmd.features.view.figures.style import COLORS, DARK_PALETTE, FAINT, PALETTE, shown_range
-from rigidmd.features.view.kind_display import panels, timeline
+from rigidmd.features.view.kind_display import panels
 from rigidmd.features.view.molecule_figure import write_molecule_figure
 from rigidmd.features.view.page import read_asset
 from rigidmd.features.view.plots import columns_figure, record_of
@@ -207,7 +208,10 @@ def test_the_figure_of_a_run_has_one_time_axis_and_stages_that_can_be_read(stage
     assert all(frame.contains(*corner) for box in boxes for corner in box.corners())
     titles = [axis.get_title(loc="left").replace("\n", " ") for axis in drifts]
     assert [title.split(":")[0] for title in titles] == [STAGES[k] for k in (1, 2, 3, 5)]
-    assert all("drift +0.1" in title for title in titles)
+    notes = [" ".join(text.get_text() for text in axis.texts) for axis in drifts]
+    assert all("drift +0.1" in note.replace("\n", " ") for note in notes)
+    assert all(axis.get_xlabel() == "time (ps)" for axis in (*drifts, temperature))
+    assert temperature.get_ylabel() == "K"
 
 
 def test_texts_of_energies_are_inside_the_figure_and_do_not_overlap(staged):
@@ -301,11 +305,13 @@ def test_colours_of_curves_are_distinguished_by_all(palette, viewer):
 def test_there_is_one_palette():
     assert list(PALETTE) == list(DARK_PALETTE)
     known = {*PALETTE.values(), *DARK_PALETTE.values(), FAINT}
-    drawn = ("figures", "view", "studies", "analysis")
-    for path in (path for name in drawn for path in (ROOT / "rigidmd" / name).rglob("*")):
-        if path.suffix in (".py", ".js") and path.name != "molecule_figure.py":  # of the elements
-            found = {*re.findall(r'"(#[0-9a-f]{6})"', path.read_text("utf-8"))} - {"#000000"}
-            assert found <= known, path
+    for folder in ("rigidmd/features", "tests/benchmarks"):
+        for path in (ROOT / folder).rglob("*"):
+            if (
+                path.suffix in (".py", ".js") and path.name != "molecule_figure.py"
+            ):  # of the elements
+                found = {*re.findall(r'"(#[0-9a-f]{6})"', path.read_text("utf-8"))} - {"#000000"}
+                assert found <= known, path
     styles = [read_asset(name) for name in ("page.css", "notebook.css")]
     for style, (name, color) in product(styles, [*PALETTE.items(), *DARK_PALETTE.items()]):
         assert f"--{name}:{color}" in style
@@ -315,9 +321,9 @@ def test_there_is_one_palette():
 def test_panels_have_the_range_of_what_is_equilibrated(staged):
     system, samples, summary = staged
     record = record_of(system, samples, summary)
-    drawn = {panel.title.split(" (")[0]: panel for panel in panels(system, record.columns)}
+    drawn = {panel.title: (times, panel) for times, panel in panels(record)}
     axis = Figure().subplots()
-    draw_panel(axis, timeline(system, record.columns), drawn["potential energy"])
+    draw_panel(axis, *drawn["potential energy"])
     low, high = axis.get_ylim()
     late = samples["potential"][samples["stage"] == 5] / 4
     assert low < late.min() < late.max() < high
@@ -356,7 +362,7 @@ def test_as_many_integrators_as_there_are_are_distinguished():
         for n, name in enumerate(names)
         for k in (1, 2, 3)
     ]
-    figure = accuracy.accuracy_figure(IntegratorAccuracy(trial_system, trials, 10, 1e-30))
+    figure = accuracy_figure(IntegratorAccuracy(trial_system, trials, 10, 1e-30), "0.1 s")
     for axis in figure.axes:
         curves = [line for line in axis.lines if line.get_label() in names]
         assert [line.get_label() for line in curves] == names
@@ -376,8 +382,92 @@ def test_as_many_integrators_as_there_are_are_distinguished():
         assert 0 < len(steps) <= len(front)  # of the best alone, and not one on another
         assert set(steps) <= set(front)
         assert axis.get_xlabel() == ""  # one label for both panels
-    assert figure.get_supxlabel() == "computing time (s) per s of motion"
+    assert figure.get_supxlabel() == "run time (s) per s of motion"
+    assert right.get_ylabel() == "rms energy error / largest kinetic energy"
     figure.draw(renderer := FigureCanvasAgg(figure).get_renderer())
     for axis in figure.axes:
         boxes = [text.get_window_extent(renderer) for text in axis.texts]
         assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
+
+
+def test_curves_are_dashed_where_timings_scatter_and_against_evaluations_if_most_do():
+    trial_system, _ = body_trial_system(Scene.read(ROOT / "systems" / "heavy_top_3.toml"), 0.1)
+
+    def figure(*spreads: float):
+        trials = [
+            Trial(
+                "velocity_verlet",
+                1e-3 / k,
+                10 * k,
+                10 * k,
+                [1.0 * k, k + spread * k],
+                *[k**-2.0] * 3,
+            )
+            for k, spread in enumerate(spreads, 1)
+        ]
+        measured = IntegratorAccuracy(trial_system, trials, 10, 1e-30)
+        return accuracy_figure(measured, "0.1 s")
+
+    drawn = figure(0.0, 0.5, 0.0, 0.0, 0.0)
+    solid, dashed = drawn.axes[1].lines[:2]
+    assert dashed.get_linestyle() == "--"
+    assert np.isfinite(dashed.get_xdata()[:3]).all()  # around the second trial
+    assert not np.isfinite(dashed.get_xdata()[3:]).all()
+    assert np.isfinite(solid.get_xdata()[-3:]).all()
+    assert "run time" in drawn.get_supxlabel()
+    unclear = figure(0.5, 0.5, 0.5)
+    assert unclear.get_supxlabel() == "force evaluations per s of motion"
+    assert unclear.axes[1].lines[0].get_xdata() == pytest.approx([100, 200, 300])
+
+
+def test_g_of_r_has_the_neighbours_within_a_distance_on_the_right():
+    r = np.linspace(0.05, 10, 200)
+    g = 1 + 2 * np.exp(-((r - 3) ** 2))
+    neighbours = r**3
+    columns = {"g O-O": g, "n O-O": neighbours, "g H-H": g / 2, "n H-H": neighbours / 2}
+    left, right = drawn(Curve("rdf", ("r (A)", r), "g(r)", columns, level=1.0)).axes
+    assert [line.get_label() for line in left.lines if line.get_linestyle() == "-"][1:] == [
+        "g O-O",
+        "g H-H",
+    ]
+    for k, name in enumerate(("n O-O", "n H-H")):
+        assert (right.lines[k].get_ydata() == columns[name]).all()
+        assert right.lines[k].get_color() == left.lines[k + 1].get_color()
+    assert 27 < right.get_ylim()[1] < 200  # the first shell can be read
+
+
+def test_columns_of_a_curve_share_colours_and_powers_are_drawn():
+    t = np.arange(1.0, 6.0)
+    columns = {f"C{n} axis {k}": t / (k + n) for k in (1, 2) for n in (1, 2)}
+    shared = Curve("orientation", ("Time (ps)", t), "C(t)", columns, per_color=2)
+    lines = drawn(shared).axes[0].lines
+    assert [line.get_color() for line in lines] == [COLORS[0]] * 2 + [COLORS[1]] * 2
+    assert [line.get_linestyle() for line in lines] == ["-", "--"] * 2
+    assert all(line.get_marker() == "o" for line in lines)  # of few points
+    straight = Curve("msd", ("Time (ps)", t), "MSD", {"MSD": t**2}, log=(True, True), power=1.0)
+    figure = drawn(straight)
+    power = figure.axes[0].lines[-1]
+    assert power.get_label() == "slope 1"
+    assert power.get_ydata() == pytest.approx(5 * t)
+    figure.draw(FigureCanvasAgg(figure).get_renderer())
+    assert figure.axes[0].get_xlabel() == "time (ps)"
+    assert "1" in [text.get_text() for text in figure.axes[0].get_xticklabels(which="both")]
+
+
+def test_a_curve_may_start_at_0_and_bands_of_first_values_do_not_set_its_range():
+    t = np.arange(1.0, 11.0)
+    errors = {"running": 100.0 / t**2}
+    curve = Curve("running", ("Time (ps)", t), "mean", {"running": 5 + 0 * t}, errors)
+    assert drawn(curve).axes[0].get_ylim()[1] < 10
+    assert drawn(replace(curve, from_zero=True)).axes[0].get_ylim()[0] == 0
+
+
+def test_errors_of_exactly_0_have_a_tick_of_that_name():
+    axis = Figure().subplots()
+    times = timeline({"time": np.arange(4.0)})
+    draw_panel(axis, times, error_panel([("L", np.array([0.0, 1e-15, 1e-14, 0.0]))]))
+    ticks = dict(
+        zip(axis.get_yticks(), (t.get_text() for t in axis.get_yticklabels()), strict=True)
+    )
+    assert ticks[FLOOR] == "0"
+    assert all(text in ("0", f"{tick:.0e}") for tick, text in ticks.items())

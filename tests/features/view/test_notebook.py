@@ -212,8 +212,11 @@ def test_analyses_show_values_and_a_figure(tmp_path):
         assert (table[names[1]].to_numpy() == result[names[1]]).all()
         assert f"{names[1]} error" in table
         assert len(repr(result.curves)) < 200
-        (axis,) = result.plot().axes
-        assert axis.get_xlabel() == names[0].replace("(A)", "(Å)")
+        axis, *others = result.plot().axes
+        assert [other.get_ylabel() for other in others] == (
+            ["neighbours within r (dashed)"] if result is g else []
+        )
+        assert axis.get_xlabel() == names[0].replace("(A)", "(Å)").replace("Time", "time")
     with pytest.raises(KeyError, match=rf"no curve 'g'; there are {g.curves[0].file}"):
         g.plot("g")
     g.plot().savefig(tmp_path / "g.svg")
@@ -282,7 +285,8 @@ def test_plots_are_of_the_columns_with_their_units():
     figure = rigidmd.view.plot(results, "temperature_translation", "pressure", "temperature")
     kelvin, pressure = figure.axes
     titles = [axis.get_title(loc="left") for axis in figure.axes]
-    assert titles == ["temperature translation, temperature (K)", "pressure (bar)"]
+    assert titles == ["temperature translation, temperature", "pressure"]
+    assert [axis.get_ylabel() for axis in figure.axes] == ["K", "bar"]
     assert pressure.get_xlabel() == "time (ps)"
     assert [text.get_text() for text in kelvin.get_legend().get_texts()] == [
         "temperature translation",

@@ -15,6 +15,7 @@ from support.pages import CHROMIUM, SHORT_WATER, data_of, is_alone, numbers
 from rigidmd import Scene, Simulation
 from rigidmd.commands import cli
 from rigidmd.features.view import molecule_animation
+from rigidmd.features.view.kind_display import panels
 from rigidmd.features.view.plots import plots_part
 from rigidmd.features.view.run_page import write_report
 from rigidmd.io.trajectory import Frames
@@ -71,16 +72,45 @@ def test_a_report_describes_molecules(water, tmp_path, capsys):
         assert f">{title}</h2>" in text
     record = read_record(water)
     own = record.columns["temperature"][record.columns["stage_name"] == "production"]
-    assert (
-        '<td>means</td><td class="wrap">over all 0.02 ps, too short to detect equilibration</td>'
-        in text
-    )
-    of_stage = text[text.index("<p>production: ") :]
-    row = re.search(r"<td>temperature</td><td>([\d.]+) K \(too short for an error\)</td>", of_stage)
+    assert ">water: 216 spce</h1>" in text
+    assert "<td>averaged over</td><td>all 0.02 ps</td>" in text
+    row = re.search(r"<td>temperature</td>(?:<td>[^<]*</td>)*<td>([\d.]+)\s±\s\?</td>", text)
     assert float(row[1]) == pytest.approx(own.mean(), abs=0.5)
     assert "barostat: no NPT or NPH stage" in text
     assert page.stat().st_size < 1e6
     assert str(page) in capsys.readouterr().out
+
+
+def test_the_drift_is_drawn_in_each_stage_in_one_unit(water):
+    record = read_record(water)
+    drifts = [
+        (times, panel) for times, panel in panels(record) if "conserved energy" in panel.title
+    ]
+    assert [panel.title.split(":")[0] for _, panel in drifts] == ["equilibration", "production"]
+    assert {panel.unit for _, panel in drifts} == {"kT per degree of freedom"}
+    for times, panel in drifts:
+        at = record.time[times.shown]
+        assert (times.time == at).all()
+        last = record.summary["stages"][times.stage[0]]
+        line = panel.curves[1][1][times.shown]
+        assert np.ptp(line) / np.ptp(at) * 1000 == pytest.approx(
+            abs(last["drift_kT_ns_per_degree_of_freedom"])
+        )
+        # kT per degree of freedom: the same ratio to kJ/mol per molecule as in the summary
+        ratio = last["drift_kT_ns_per_degree_of_freedom"] / last["drift_kJ_mol_ns_per_molecule"]
+        values = record.columns["drift"][times.shown] / 216
+        assert panel.curves[0][1][times.shown] == pytest.approx(ratio * values)
+
+
+def test_the_animation_of_molecules_starts_with_the_last_stage(water, tmp_path):
+    page = tmp_path / "water.html"
+    assert cli.main(["view", str(water), "-o", str(page)]) == 0
+    text, record = page.read_text("utf-8"), read_record(water)
+    times = numbers(data_of(page)["time"], "<f8")
+    production = record.time[record.columns["stage_name"] == "production"]
+    assert data_of(page)["begin"] == times[times >= production[0]][0] > times[0]
+    assert text.index("Means of each stage") < text.index('class="plots"')  # beside the animation
+    assert text.count("<h1>") == 1
 
 
 def test_a_report_describes_a_body(top, capsys):

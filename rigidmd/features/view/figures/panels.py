@@ -7,17 +7,22 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from rigidmd.core.statistics import format_signed
+from rigidmd.core.toml import Json
 from rigidmd.engines.samples import moving
 from rigidmd.features.view.figures.style import (
     COLORS,
     FAINT,
     INK,
+    TEXT,
+    TITLE,
     largest_of_parts,
     new_figure,
     open_axis,
     shown_range,
     thin_series,
 )
+from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,9 +31,9 @@ if TYPE_CHECKING:
     from rigidmd.features.view.figures.picture import Picture
 
 #: Inches: a line of text, the space left and right of an axis.
-LINE, LEFT, RIGHT = 0.165, 0.75, 0.2
-#: Inches below an axis: without numbers, with them, with numbers and their unit.
-GAP, NUMBERS, FOOT = 0.08, 0.3, 0.42
+LINE, LEFT, RIGHT = 0.165, 1.05, 0.2
+#: Inches below an axis: without numbers, with numbers and their unit.
+GAP, FOOT = 0.08, 0.42
 #: Most rows of names of stages.
 MOST_ROWS = 5
 #: Inches: width of a figure, height of a panel.
@@ -39,16 +44,25 @@ BINS = 600
 LETTER = 0.068
 #: Ranges below this fraction of the values are rounding.
 ROUNDING = 1e-9
+#: Most stages whose drift is drawn, the last ones.
+MOST_DRIFTS = 4
+PER_MOLECULE, PER_FREEDOM = "kJ/mol per molecule", "kT per degree of freedom"
+#: The drift and its error in a summary, in these units.
+DRIFT_PER_MOLECULE = "drift_kJ_mol_ns_per_molecule", "drift_error_kJ_mol_ns_per_molecule"
+DRIFT_PER_FREEDOM = "drift_kT_ns_per_degree_of_freedom", "drift_error_kT_ns_per_degree_of_freedom"
 
 
 class Panel(NamedTuple):
     """Curves on one axis."""
 
-    title: str  # with the unit
+    title: str
     curves: list[tuple[str, np.ndarray]]  # label, values (t,)
+    unit: str = ""  # the label of the axis
+    note: str = ""  # above the curves
     log: bool = False
     least: float = 0.0  # a smaller range is rounding
     level: float | None = None  # a dotted line
+    zero: float | None = None  # where errors of exactly 0 are drawn, on a logarithmic axis
 
     def columns(self, width: float) -> int:
         """How many labels of its legend are next to one another in a width in inches."""
@@ -90,8 +104,10 @@ class Timeline(NamedTuple):
         return Timeline(shown, self.time[part], self.stage[part], self.unit)
 
 
-#: Rows of panels, each with its times.
-Rows = Sequence[Sequence[tuple[Timeline, Panel]]]
+#: A panel with its times.
+TimedPanel = tuple[Timeline, Panel]
+#: Rows of panels.
+Rows = Sequence[Sequence[TimedPanel]]
 
 
 def molecular_timeline(system: "System", columns: Mapping[str, np.ndarray]) -> Timeline:
@@ -101,28 +117,78 @@ def molecular_timeline(system: "System", columns: Mapping[str, np.ndarray]) -> T
     return Timeline(shown, time[shown], stage[shown], "ps", names)
 
 
-def molecular_panels(system: "System", columns: Mapping[str, np.ndarray]) -> list[Panel]:
+def molecular_panels(
+    system: "System", columns: Mapping[str, np.ndarray], stages: Sequence[Json] = ()
+) -> list[TimedPanel]:
+    """Temperatures, energies, pressure and box over the run, and the drift of the conserved energy
+    in the last stages. stages : of the summary"""
     count = len(system.model.species)
-    shown = moving(system.scene.stages, columns["stage"])
+    times = molecular_timeline(system, columns)
 
-    def panel(title: str, labels: dict[str, str], per: int = 1) -> list[Panel]:
+    def panel(title: str, unit: str, labels: dict[str, str], per: int = 1) -> list[TimedPanel]:
         curves = [
             (label, columns[name] / per)
             for name, label in labels.items()
-            if name in columns and np.isfinite(columns[name][shown]).any()
+            if name in columns and np.isfinite(columns[name][times.shown]).any()
         ]
-        return [Panel(title, curves)] if curves else []
+        return [(times, Panel(title, curves, unit))] if curves else []
 
-    per_molecule = "(kJ/mol per molecule)"
     temperatures = {"temperature_translation": "translation", "temperature_rotation": "rotation"}
-    found = panel("temperature (K)", temperatures)
-    found += panel(f"potential energy {per_molecule}", {"potential": ""}, count)
-    found += panel(f"conserved energy since its stage began {per_molecule}", {"drift": ""}, count)
-    found += panel("pressure (bar)", {"pressure": ""})
+    found = panel("temperature", "K", temperatures)
+    found += panel("potential energy", PER_MOLECULE, {"potential": ""}, count)
+    found += drift_panels(system, columns, stages)
+    found += panel("pressure", "bar", {"pressure": ""})
     if "density" in columns and np.ptp(np.nan_to_num(columns["density"])) > 0:
-        found += panel("density (g/cm³)", {"density": ""})
-        found += panel("edges of the box (Å)", {edge: edge for edge in "abc"})
+        found += panel("density", "g/cm³", {"density": ""})
+        found += panel("edges of the box", "Å", {edge: edge for edge in "abc"})
     return found
+
+
+def drift_panels(
+    system: "System", columns: Mapping[str, np.ndarray], stages: Sequence[Json] = ()
+) -> list[TimedPanel]:
+    """The conserved energy in each of the last stages, each on its own scale, and the line of its
+    drift from the summary. stages : of the summary"""
+    if "drift" not in columns:
+        return []
+    times = molecular_timeline(system, columns)
+    found = []
+    for k in np.unique(times.stage)[-MOST_DRIFTS:].tolist():
+        part = times.of_stage(k)
+        # an external engine may not report it
+        if part.time.size > 1 and np.isfinite(columns["drift"][part.shown]).any():
+            stage = stages[k] if k < len(stages) else {}  # {}: of a run that has not ended
+            found.append((part, _drift_panel(part, k, columns["drift"], stage, system)))
+    return found
+
+
+def _drift_panel(
+    times: Timeline, k: int, drift: np.ndarray, stage: Json, system: "System"
+) -> Panel:
+    """The conserved energy since a stage began, in kT per degree of freedom as in the summary, and
+    the line of its drift. In kJ/mol per molecule if there is no temperature."""
+    title = f"{system.scene.stages[k].label}: conserved energy"
+    unit, key, values = PER_MOLECULE, DRIFT_PER_MOLECULE, drift / len(system.model.species)
+    thermal = BOLTZMANN / KJ_PER_MOL * (stage.get("temperature_K") or 0.0)
+    if thermal > 0 and stage.get(DRIFT_PER_FREEDOM[0]) is not None:
+        unit, key = PER_FREEDOM, DRIFT_PER_FREEDOM
+        values = drift / (thermal * system.freedom_in(k).total)
+    gradient, error = map(stage.get, key)
+    if gradient is None or times.time.size <= 2:
+        return Panel(title, [("", values)], unit)
+    line = np.full(len(values), np.nan)
+    line[times.shown] = values[times.shown].mean() + gradient / 1000 * (
+        times.time - times.time.mean()
+    )
+    rate, verdict = (
+        text.replace(" ", "\N{NO-BREAK SPACE}")
+        for text in (
+            format_signed(gradient, error),
+            (stage.get("drift_verdict") or "").partition(",")[0],
+        )
+    )
+    note = f"drift {rate} per ns{verdict and f': {verdict}'}"
+    return Panel(title, [("", values), ("", line)], unit, note)
 
 
 def draw_panel(axis: "Axes", times: Timeline, panel: Panel) -> None:
@@ -148,18 +214,20 @@ def draw_panel(axis: "Axes", times: Timeline, panel: Panel) -> None:
         axis.set_yscale("log")
         axis.yaxis.set_major_formatter("{x:.0e}")
         axis.set_ylim(low / 2 or None, 2 * high or None)
+        if low == panel.zero:
+            _label_zero(axis, panel.zero)
     else:
         margin = 0.05 * (high - low)
         if not high - low > max(panel.least, ROUNDING * max(abs(low), abs(high))):
             margin = 0.05 * max(abs(low), abs(high)) or 1.0
         axis.set_ylim(low - margin, high + margin)
         axis.locator_params(axis="y", nbins=6)
-        axis.yaxis.set_major_formatter("{x:.6g}")
+        axis.yaxis.set_major_formatter(_tick_text)
     if panel.level is not None:
         axis.axhline(panel.level, color=FAINT, lw=0.8, ls=":")
     for start, _ in times.starts[1:]:
         axis.axvline(start, color=FAINT, lw=0.6, ls=":")
-    open_axis(axis, labelsize=8)
+    open_axis(axis, labelsize=TEXT)
 
 
 def draw_rows(figure: "Picture", rows: Rows, area: Sequence[float]) -> "list[Axes]":
@@ -172,8 +240,8 @@ def draw_rows(figure: "Picture", rows: Rows, area: Sequence[float]) -> "list[Axe
         max(panel.margin_above(width) for _, panel in row)
         for row, width in zip(rows, widths, strict=True)
     ]
-    # numbers below the last row, and below rows whose axes end elsewhere
-    feet = [GAP if len(row) == 1 else NUMBERS for row in rows[:-1]] + [FOOT]
+    # times below the last row, and below rows whose axes end elsewhere
+    feet = [GAP if len(row) == 1 else FOOT for row in rows[:-1]] + [FOOT]
     height = (top - bottom - sum(heads) - sum(feet)) / len(rows)
     axes, named = [], False
     for row, width, head, foot in zip(rows, widths, heads, feet, strict=True):
@@ -184,9 +252,12 @@ def draw_rows(figure: "Picture", rows: Rows, area: Sequence[float]) -> "list[Axe
             axes.append(axis)
             draw_panel(axis, times, panel)
             _head(axis, panel, width)
+            _write_note(axis, wrap(panel.note, int(width / LETTER)))
+            unit = "\n".join(_balanced(panel.unit, int(height / LETTER)))
+            axis.set_ylabel(unit, fontsize=TEXT, color=INK)
             axis.tick_params(labelbottom=foot > GAP)
             if foot == FOOT:
-                axis.set_xlabel(f"time ({times.unit})", fontsize=8, color=INK)
+                axis.set_xlabel(f"time ({times.unit})", fontsize=TEXT, color=INK)
             if len(times.starts) > 1 and not named:
                 named = True
                 _label_stages(axis, times.starts, width)
@@ -194,15 +265,48 @@ def draw_rows(figure: "Picture", rows: Rows, area: Sequence[float]) -> "list[Axe
     return axes
 
 
+def _tick_text(value: float, _: int) -> str:
+    """A number at a tick, where neighbours such as 5e-05 and 0.0001 have one form."""
+    text = f"{value:.6g}"
+    if 1e-6 < abs(value) < 1e-4:
+        text = np.format_float_positional(float(text), trim="-")
+    return text.replace("-", "\N{MINUS SIGN}")
+
+
+def _balanced(text: str, most: int) -> list[str]:
+    """A text in as few lines as fit, of about one length."""
+    lines = -(-len(text) // max(1, most))
+    return wrap(text, len(text) // lines + 3) if lines > 1 else [text]
+
+
+def _label_zero(axis: "Axes", zero: float) -> None:
+    """Label a power of ten on a logarithmic axis as 0."""
+    from matplotlib.ticker import FixedLocator, FuncFormatter
+
+    decades = np.log10(axis.get_ylim()[1] / zero)
+    ticks = np.arange(0, decades, max(1, round(decades / 6)))
+    axis.yaxis.set_major_locator(FixedLocator(zero * 10.0**ticks))
+    axis.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:.0e}" if x > 2 * zero else "0"))
+
+
+def _write_note(axis: "Axes", lines: Sequence[str]) -> None:
+    """Write lines above the curves."""
+    if lines:
+        style = {"va": "top", "fontsize": TEXT, "color": INK}
+        axis.text(0.02, 0.99, "\n".join(lines), transform=axis.transAxes, **style)
+        low, high = axis.get_ylim()
+        axis.set_ylim(low, high + 0.14 * len(lines) * (high - low))
+
+
 def _head(axis: "Axes", panel: Panel, width: float) -> None:
     """Draw the title of a panel, and below it the legend."""
     lines, rows = panel.head(width)
     pad = 72 * LINE * rows + 5
-    axis.set_title("\n".join(lines), loc="left", fontsize=9, color=INK, pad=pad)
+    axis.set_title("\n".join(lines), loc="left", fontsize=TITLE, color=INK, pad=pad)
     if rows:
         axis.legend(
             ncols=panel.columns(width),
-            fontsize=8,
+            fontsize=TEXT,
             labelcolor=INK,
             loc="lower left",
             bbox_to_anchor=(0, 1),
@@ -243,7 +347,7 @@ def _label_stages(axis: "Axes", starts: Sequence[tuple[float, str]], width: floa
             xycoords=("data", "axes fraction"),
             textcoords="offset points",
             va="top",
-            fontsize=8,
+            fontsize=TEXT,
             color=FAINT,
             ha=side,
         )

@@ -42,6 +42,10 @@ DARK_PALETTE = {
 }
 COLORS = tuple(PALETTE.values())
 COOL, WARM, AMBER, INK, *_ = COLORS
+#: Points: size of text, of titles of panels and of figures.
+TEXT, TITLE, HEADING = 8.0, 9.0, 11.0
+#: Numbers at logarithmic ticks from which to which they are not powers of ten.
+PLAIN = 0.01, 1000.0
 FAINT = "#8a8f99"  # of what is not a curve: frames, notes, the backs of things
 MARKERS = "os^Dv*PX<>"
 DASHES = ((), (5, 1.5), (1.5, 1.2), (6, 1.5, 1.5, 1.5))
@@ -59,7 +63,7 @@ def curve_style(k: int, *, connected: bool = True) -> dict:
 
 def head(figure: "Picture", title: str) -> None:
     """Put a title above all axes of a figure, on the left."""
-    figure.suptitle(title, color=INK, x=0.01, ha="left", fontsize=11)
+    figure.suptitle(title, color=INK, x=0.01, ha="left", fontsize=HEADING)
 
 
 @contextmanager
@@ -171,10 +175,16 @@ def shown_range(values: np.ndarray, stage: np.ndarray) -> tuple[float, float] | 
     return low - 0.05 * (high - low), high + 0.05 * (high - low)
 
 
-def label_minor_ticks(line: "Axis") -> None:
-    """Label a logarithmic axis (`axis.xaxis` or `.yaxis`) between powers of ten if it has fewer
-    than two of them."""
+def label_ticks(line: "Axis") -> None:
+    """Label a logarithmic axis (`axis.xaxis` or `.yaxis`) by plain numbers, powers of ten if they
+    are small or large, and between powers of ten if it has fewer than two of them."""
     from matplotlib.ticker import LogFormatterSciNotation
 
-    line.set_minor_formatter(LogFormatterSciNotation(minor_thresholds=(1.0, 0.5)))
-    line.set_tick_params(which="minor", labelsize=7)
+    class Plain(LogFormatterSciNotation):
+        def __call__(self, x, pos=None):
+            text = super().__call__(x, pos)
+            return f"{x:g}" if text and PLAIN[0] <= x <= PLAIN[1] else text
+
+    line.set_major_formatter(Plain(labelOnlyBase=False))
+    line.set_minor_formatter(Plain(minor_thresholds=(1.0, 0.5)))
+    line.set_tick_params(which="both", labelsize=TEXT)
