@@ -88,8 +88,8 @@ def write_results(
         lines = (list(map(nine_digits, line)) for line in zip(*columns.values(), strict=True))
         write_csv(folder / f"{curve.file}.csv", [list(columns), *lines], quote_text=True)
     write_json(folder / ANALYSIS, {"analyses": entries}, indent=1, ensure_ascii=False)
-    for curve in curves:
-        title = f"{folder.absolute().name}: {curve.file.replace('_', ' ')}"
+    for about, curve in [(r.title_of(curve), curve) for r in results for curve in r.curves]:
+        title = f"{folder.absolute().name}: {about}"
         write_figure(folder / f"{curve.file}.{figures}", partial(curve_figure, curve), title)
         for other in (
             {f"{curve.file}.{kind}" for kind in FIGURES} & owner.keys() & {*marked} - new.keys()
@@ -106,6 +106,10 @@ class _Curve(BaseModel):
     log: tuple[bool, bool]
     level: Bounded | None
     bars: bool
+    # not in files of rigidmd 0.2
+    per_color: int = 1
+    power: Bounded | None = None
+    from_zero: bool = False
 
 
 class _FramesUsed(BaseModel):

@@ -94,6 +94,12 @@ class Curve:
         A level to draw, such as 1 of g(r)
     bars : bool
         Whether the axis is of integers, and bars are drawn
+    per_color : int
+        This number of neighbouring columns have one colour, and other dashes
+    power : float or None
+        The exponent of a power of x to draw, such as 1 of a displacement by diffusion
+    from_zero : bool
+        Whether the axis of y starts at 0
     """
 
     file: str
@@ -104,6 +110,9 @@ class Curve:
     log: tuple[bool, bool] = (False, False)
     level: float | None = None
     bars: bool = False
+    per_color: int = 1
+    power: float | None = None
+    from_zero: bool = False
 
     def __repr__(self) -> str:
         """Short: the numbers of a curve would flood a screen."""
@@ -226,8 +235,13 @@ class AnalysisResult(Displayed):
                 f"the analysis {self.name} has no curves: {'; '.join(map(str, self.values))}"
             )
         if curve or len(self.curves) == 1:
-            return curve_figure(self._curve(curve))
+            shown = self._curve(curve)
+            return curve_figure(shown, self.title_of(shown))
         return curves_figure(self.curves, self.about)
+
+    def title_of(self, curve: Curve) -> str:
+        """The title of the figure of one of its curves."""
+        return self.about if len(self.curves) == 1 else curve.label.partition(" (")[0]
 
     def to_dataframe(self, curve: str = "") -> "pandas.DataFrame":
         """The columns of a curve with their errors, as in its CSV file. Without curves, the values.

@@ -68,7 +68,7 @@ def orientation(runs: Runs) -> AnalysisResult:
     interval, lags = interval_and_lags(runs, "an orientational correlation")
     time = interval * np.arange(lags)
     result = AnalysisResult("orientation", "orientational correlation")
-    curve = Curve("orientation", ("Time (ps)", time), "C(t)", {}, level=0.0)
+    curve = Curve("orientation", ("Time (ps)", time), "C(t)", {}, level=0.0, per_color=2)
     result.curves.append(curve)
     for kind in kinds:
         if (along := _axis_along_dipole(kind)) is not None:
@@ -380,8 +380,11 @@ def dielectric(runs: Runs) -> AnalysisResult:
     count = np.arange(1, runs.shortest + 1)
     running = np.mean([np.cumsum(of_run[: runs.shortest]) / count for of_run in squares], axis=0)
     time = ("Time (ps)", shown[1])
-    so_far = {"dielectric constant": _of_fluctuation(per_square * running, around)[0]}
-    result.curves.append(Curve("dielectric", time, "dielectric constant so far", so_far))
+    so_far, slopes = _of_fluctuation(per_square * running, around)
+    errors = relative_error * np.sqrt(runs.shortest / count) * per_square * running * slopes
+    curve = Curve("dielectric", time, "dielectric constant so far", {}, from_zero=True)
+    curve.add("dielectric constant", so_far, np.abs(errors))
+    result.curves.append(curve)
     if not runs.are_several:
         columns = {f"M{axis} (D)": shown[0][:, k] / DEBYE for k, axis in enumerate("xyz")}
         result.curves.append(Curve("dipole", time, "total dipole (D)", columns))

@@ -39,6 +39,9 @@ LARGEST, WIDTH = 10.0, 0.05
 LENGTHS, MOST_BINS, MOST_VECTORS = Limits(1e-4, 1e6), 20_000, 5e7
 #: 1/Å: largest wave vector and width of bins of S(k); most wave vectors of a bin.
 K_MAX, K_WIDTH, VECTORS_PER_BIN = 8.0, 0.1, 24
+#: Bins of a density profile where the density changes along the axis and elsewhere, and the lowest
+#: density of a uniform one in units of its mean.
+MANY_BINS, FEW_BINS, LEAST_DENSITY = 100, 20, 0.5
 #: Blocks of frames for errors of peaks; least fraction of the variance of blocks by which their
 #: correlation reduces it.
 PEAK_BLOCKS, LEAST_INDEPENDENT = 10, 0.25
@@ -370,7 +373,7 @@ def _k_vectors(reciprocal: np.ndarray, largest: float) -> tuple[np.ndarray, np.n
 
 
 @built_in("profile of the density along an axis of the box", position=30, needs=(trajectory, box))
-def density_profile(runs: Runs, axis: Axis = "z", bins: Count = 100) -> AnalysisResult:
+def density_profile(runs: Runs, axis: Axis = "z", bins: Count | None = None) -> AnalysisResult:
     """Mass density (g/cm³) of each species along an edge of the box.
 
     Parameters
@@ -378,14 +381,14 @@ def density_profile(runs: Runs, axis: Axis = "z", bins: Count = 100) -> Analysis
     axis : {"z", "x", "y"}, optional
         The edge c, a or b
     bins : int, optional
-        Number of bins along the edge
+        Number of bins along the edge. Default: 100 where the density changes, as in a slab, else 20
     """
     k = "xyz".index(axis)
     height = float(
         runs.mean([np.mean([heights(cell)[k] for cell in run.cell]) for run in runs.members])
     )
 
-    def profile(part: RigidFrames, kind: Kind) -> np.ndarray:
+    def profile(part: RigidFrames, kind: Kind, bins: int) -> np.ndarray:
         across = np.linalg.inv(part.cell)[:, :, k]
         total = np.zeros(bins)
         for site, mass in enumerate(kind.molecule.masses):
@@ -398,14 +401,18 @@ def density_profile(runs: Runs, axis: Axis = "z", bins: Count = 100) -> Analysis
             )
         return total * bins / len(part) / float(part.volume.mean()) / GRAM_PER_CM3
 
-    def profile_of_all(kinds, part) -> np.ndarray:
-        return np.sum([profile(part, kind) for kind in kinds], axis=0)
+    def profile_of_all(kinds, bins, part) -> np.ndarray:
+        return np.sum([profile(part, kind, bins) for kind in kinds], axis=0)
 
+    if bins is None:
+        density = runs.mean([profile_of_all(runs.kinds, FEW_BINS, run) for run in runs.members])
+        is_uniform = density.min() > LEAST_DENSITY * density.mean()
+        bins = FEW_BINS if is_uniform else MANY_BINS
     at = (np.arange(bins) + 0.5) * height / bins
-    curve = Curve("density_profile", (f"{axis} (A)", at), "density (g/cm³)", {})
+    curve = Curve("density_profile", (f"{axis} (A)", at), "density (g/cm³)", {}, from_zero=True)
     for name in dict.fromkeys(kind.name for kind in runs.kinds):
         of_name = [kind for kind in runs.kinds if kind.name == name]  # frozen and mobile ones
-        together = partial(profile_of_all, of_name)
+        together = partial(profile_of_all, of_name, bins)
         curve.add(f"density {name} (g/cm3)", *with_block_error(runs, together))
     return AnalysisResult("density_profile", f"density along {axis}", curves=[curve])
 

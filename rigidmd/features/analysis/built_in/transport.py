@@ -94,9 +94,8 @@ def msd(runs: Runs) -> AnalysisResult:
 
     Paths continue through the faces of the box, without the scaling by a barostat."""
     interval, lags = interval_and_lags(runs, "a mean squared displacement")
-    curve = Curve(
-        "msd", ("Time (ps)", interval * np.arange(lags)), "MSD (Å²)", {}, log=(True, True)
-    )
+    time = ("Time (ps)", interval * np.arange(lags))
+    curve = Curve("msd", time, "MSD (Å²)", {}, log=(True, True), power=1.0)
     for kind in runs.moving:
         displacement_and_error = with_group_error(
             runs, kind, lambda part, group: squared_displacement(part.paths[:, group.index], lags)
