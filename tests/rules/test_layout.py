@@ -81,7 +81,8 @@ TESTED_BY = {
     " features/bodies/animation features/view/molecule_animation features/view/page features/view/solids",
     "features/view/test_mesh.py": "features/bodies/edges",
     "features/view/test_figures.py": "features/analysis/curve_figure features/bodies/figures features/view/figures/energy features/view/figures/panels"
-    " features/view/figures/picture features/view/figures/space features/view/figures/style",
+    " features/view/figures/picture features/view/figures/space features/view/figures/style"
+    " features/studies/accuracy/figure",
     "features/view/test_notebook.py": "features/analysis/result features/bodies/display features/view/kind_display core/display features/view/plots",
     "features/view/test_run_page.py": "features/view/commands/report features/view/stage_tables",
     "forces/ewald/test_direct_sum.py": "forces/ewald/smooth",

@@ -10,7 +10,13 @@ import numpy as np
 
 from rigidmd.core.integrators import RADAU, SCHEMES
 from rigidmd.errors import SceneError, option
-from rigidmd.features.studies.accuracy.measurement import IntegratorAccuracy, measure, plan
+from rigidmd.features.studies.accuracy.figure import accuracy_figure
+from rigidmd.features.studies.accuracy.measurement import (
+    DOUBTFUL,
+    IntegratorAccuracy,
+    measure,
+    plan,
+)
 from rigidmd.features.studies.accuracy.orders import ENERGY, FLOOR_MARK, order_table, with_marks
 from rigidmd.features.studies.accuracy.start import (
     check_engine_is_rigidmd,
@@ -19,15 +25,7 @@ from rigidmd.features.studies.accuracy.start import (
     start_of_last_stage,
 )
 from rigidmd.features.studies.kind_study import AccuracyStart, study_of
-from rigidmd.features.view.figures.style import (
-    FAINT,
-    INK,
-    curve_style,
-    label_minor_ticks,
-    new_figure,
-    open_axis,
-    write_figure,
-)
+from rigidmd.features.view.figures.style import write_figure
 from rigidmd.features.view.page import chips, code, items, section, table, wide, write_page
 from rigidmd.io.write import Column, ReportTable, columns_text
 from rigidmd.run.force_errors import single_precision_errors
@@ -149,8 +147,6 @@ def _method_name(name: str, scene: Scene) -> str:
 
 
 FILES = ("accuracy.csv", "accuracy.png", "accuracy.html")
-LABEL = (0.14, 0.045)  # width and height of the label of a step, as fractions of an axis
-DOUBTFUL = 0.2  # spread of repeated timings that causes a warning
 
 
 def trial_table(measured: IntegratorAccuracy, *, marked: bool = False) -> ReportTable:
@@ -347,95 +343,8 @@ def cheapest(measured: IntegratorAccuracy) -> list[tuple[str, str, str, str]]:
 def write_accuracy(folder: Path, measured: IntegratorAccuracy, command: str) -> None:
     trial_table(measured).write(folder / FILES[0])
     title = f"{measured.trial_system.name}: error against run time"
-    write_figure(folder / FILES[1], lambda: accuracy_figure(measured), title)
+    write_figure(folder / FILES[1], lambda: accuracy_figure(measured, _span(measured)), title)
     write_page(folder / FILES[2], title, _page_parts(measured, command))
-
-
-def _label_steps(axis, points: list[tuple[float, float, float]], unit: str) -> None:
-    """Label points (time, error, step) in this order, each that is far enough from those labelled
-    before."""
-    left, right = axis.get_xlim()
-    left *= (left / right) ** LABEL[0]  # space for the label of the first point
-    axis.set_xlim(left, right)
-    low, high = axis.get_ylim()
-    size = np.array([np.log(right / left), np.log(high / low)])
-    labelled = np.empty((0, 2))
-    for time, error, step in points:
-        at = np.log([time, error]) / size
-        if (np.abs(at - labelled) > LABEL).any(axis=1).all():
-            axis.annotate(
-                f"{step:.2g} {unit}",
-                (time, error),
-                xytext=(-6, -6),
-                textcoords="offset points",
-                fontsize=7,
-                color=INK,
-                ha="right",
-                va="top",
-            )
-            labelled = np.vstack([labelled, at])
-
-
-def accuracy_figure(measured: IntegratorAccuracy):
-    """Log error against log run time, a curve for each integrator. Rings mark the best trials, bars
-    the time spread."""
-    s = measured.trial_system
-    figure = new_figure(10, 4.8)
-    left, right = figure.subplots(1, 2)
-    of = "Q" if measured.rotates else f"X ({s.length_unit})"
-    titles = {
-        "trajectory_error": f"error of {of} after {_span(measured)}",
-        "energy_rms": f"rms error of the energy, {s.energy_unit}",
-    }
-    for axis, (error, title) in zip((left, right), titles.items(), strict=True):
-        for k, name in enumerate(measured.integrators):
-            trials = measured.bounded(name, error)
-            times = [t.time / s.span for t in trials]
-            errors = [getattr(t, error) for t in trials]
-            style = curve_style(k)
-            axis.loglog(times, errors, ms=3.5, lw=1.2, label=name, **style)
-            low, high = (
-                [abs(end(t.seconds) - t.time) / s.span for t in trials] for end in (min, max)
-            )
-            axis.errorbar(
-                times, errors, xerr=[low, high], fmt="none", ecolor=style["color"], elinewidth=0.7
-            )
-        front = [t for t in measured.front(error) if getattr(t, error) > 0]
-        points = [(t.time / s.span, getattr(t, error), t.timestep) for t in front]
-        axis.loglog(
-            [time for time, *_ in points],
-            [error for _, error, _ in points],
-            "o",
-            ms=9,
-            mfc="none",
-            mec=INK,
-            mew=0.8,
-            label="best, with its step",
-        )
-        _label_steps(axis, points, s.time_unit)
-        axis.set_title(title, loc="left", fontsize=9, color=INK)
-        open_axis(axis, which="both")
-        label_minor_ticks(axis.xaxis)
-        label_minor_ticks(axis.yaxis)
-    figure.supxlabel(f"computing time (s) per {s.span_unit} of motion", color=INK, fontsize=10)
-    left.axhline(measured.reference_error, color=FAINT, lw=0.8, ls=":")
-    left.annotate(
-        "error of the reference",
-        (0.01, measured.reference_error),
-        xycoords=("axes fraction", "data"),
-        fontsize=8,
-        color=FAINT,
-        va="bottom",
-    )
-    right.legend(
-        frameon=False,
-        fontsize=8,
-        handlelength=2.8,
-        loc="center left",
-        bbox_to_anchor=(1.0, 0.5),
-        labelcolor=INK,
-    )
-    return figure
 
 
 def _page_parts(measured: IntegratorAccuracy, command: str) -> Iterator[str]:
@@ -447,7 +356,9 @@ def _page_parts(measured: IntegratorAccuracy, command: str) -> Iterator[str]:
         "equally fast within timing noise",
     ]
     advice = table(titles, cheapest(measured), words=True)
-    drawn = wide(accuracy_figure(measured), "accuracy", "log error over log run time")
+    drawn = wide(
+        accuracy_figure(measured, _span(measured)), "accuracy", "log error over log run time"
+    )
     yield section("Recommendations", advice, items(remarks(measured)))
     yield section("Error against run time", drawn)
     yield section("All trials", table(*trial_table(measured).shown(), marked=colored))

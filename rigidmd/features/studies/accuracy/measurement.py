@@ -22,6 +22,8 @@ from rigidmd.run.trials import (
     state_difference,
 )
 
+#: Spread of repeated timings that causes a warning.
+DOUBTFUL = 0.2
 #: Fraction of an integrator's longest stable step that is recommended, where a longer one diverges.
 STABLE_FRACTION = 0.8
 #: Minimum steps in a span of a trial that extends the steps of an integrator.

@@ -29,6 +29,8 @@ from rigidmd.features.studies.sweep.table import (
 from rigidmd.features.view.figures.style import (
     FAINT,
     INK,
+    TEXT,
+    TITLE,
     curve_style,
     open_axis,
     panel_grid,
@@ -89,10 +91,12 @@ def write_analyses_figure(table: Table, name: str) -> None:
         write_figure(table.folder / ANALYSES_FIGURE, lambda: draw_table(table, columns), title)
 
 
-def axis_label(key: str, together: Iterable[str]) -> str:
-    """A swept key as the label of an axis: with its unit, and with the keys that vary together with
-    it."""
-    label = readable_key(key)
+def axis_label(key: str, together: Iterable[str], short: str = "") -> str:
+    """A swept key as the label of an axis, as in the table: with its unit, and with the keys that
+    vary together with it. short : the key without what all keys have"""
+    label = readable_key(short or key)
+    if key != SEED:
+        label = f"set {label}"
     others = [other for other in together if other != key]
     return f"{label}\ntogether with {', '.join(others)}" if others else label
 
@@ -116,8 +120,8 @@ def panels(columns: Sequence[str]) -> "tuple[Picture, list[Axes]]":
     figure, axes = panel_grid(len(columns), 2 if len(columns) <= MOST_PANELS else 3, 4.4, 3.0, 0.4)
     for axis, column in zip(axes, columns, strict=True):
         title = titles.get(column, column)
-        axis.set_title(title, loc="left", fontsize=9, color=INK)
-        open_axis(axis, labelsize=8)
+        axis.set_title(title, loc="left", fontsize=TITLE, color=INK)
+        open_axis(axis, labelsize=TEXT)
     return figure, axes
 
 
@@ -131,7 +135,7 @@ def add_legend(figure: "Picture", axis: "Axes") -> None:
             loc="outside lower center",
             ncols=4,
             frameon=False,
-            fontsize=8,
+            fontsize=TEXT,
             labelcolor=INK,
         )
 
@@ -160,9 +164,11 @@ def draw_table(table: Table, columns: list[str]) -> "Picture":
         label = describe_values({other: row.values[other] for other in others}, others)
         curves.setdefault(label, []).append(row)
     values = [row.values[key] for row in rows]
+    short = short_keys(table.keys).get(key, key)
+    label = axis_label(key, table.together.get(key, ()), short)
     for axis, column in zip(axes, columns, strict=True):
         _draw(axis, curves, key, column)
-        axis.set_xlabel(axis_label(key, table.together.get(key, ())), fontsize=9, color=INK)
+        axis.set_xlabel(label, fontsize=TITLE, color=INK)
         if numbers and all(float(value).is_integer() for value in values):
             axis.locator_params(axis="x", integer=True)
         elif not numbers and max(len(value_name(value)) for value in values) > LONG_WORD:

@@ -74,16 +74,16 @@ timestep_fs = 5
 @pytest.mark.parametrize(
     ("key", "together", "label"),
     [
-        ("stages.density.temperature_K", [], "temperature of stages.density (K)"),
-        ("box.density_g_cm3", ["box.density_g_cm3"], "density of box (g/cm³)"),
+        ("stages.density.temperature_K", [], "set temperature of stages.density (K)"),
+        ("box.density_g_cm3", ["box.density_g_cm3"], "set density of box (g/cm³)"),
         (
             "stages.0.timestep_fs",
             ["stages.0.timestep_fs", "seed"],
-            "timestep of stages.0 (fs)\ntogether with seed",
+            "set timestep of stages.0 (fs)\ntogether with seed",
         ),
-        ("molecules.0.count", [], "count of molecules.0"),
+        ("molecules.0.count", [], "set count of molecules.0"),
         ("seed", [], "seed"),
-        ("stages.0.pressure_bar", [], "pressure of stages.0 (bar)"),
+        ("stages.0.pressure_bar", [], "set pressure of stages.0 (bar)"),
     ],
 )
 def test_axes_have_units_and_name_the_keys_that_vary_together(key, together, label):
