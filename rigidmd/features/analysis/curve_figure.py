@@ -103,7 +103,7 @@ def _draw_column(
 
 def _set_range(axis: "Axes", curve: "Curve", heights: np.ndarray) -> None:
     """Set the range of y to the values and the bands of their later half: errors of the first
-    values of a running mean are large. It starts at 0 if the curve asks for it."""
+    values of a running mean are large. Some start at 0."""
     if not curve.log[1] and not curve.bars:
         late = slice(heights.shape[1] // 2, None)
         ends = [heights.min(), heights.max()]

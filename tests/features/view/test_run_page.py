@@ -109,7 +109,7 @@ def test_the_animation_of_molecules_starts_with_the_last_stage(water, tmp_path):
     times = numbers(data_of(page)["time"], "<f8")
     production = record.time[record.columns["stage_name"] == "production"]
     assert data_of(page)["begin"] == times[times >= production[0]][0] > times[0]
-    assert text.index("Means of each stage") < text.index('class="plots"')  # beside the animation
+    assert text.index("Means of each stage") < text.index('class="plots"')  # next to the animation
     assert text.count("<h1>") == 1
 
 

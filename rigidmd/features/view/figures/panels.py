@@ -166,7 +166,7 @@ def _drift_panel(
     times: Timeline, k: int, drift: np.ndarray, stage: Json, system: "System"
 ) -> Panel:
     """The conserved energy since a stage began, in kT per degree of freedom as in the summary, and
-    the line of its drift. In kJ/mol per molecule if there is no temperature."""
+    the line of its drift. In kJ/mol per molecule without a temperature."""
     title = f"{system.scene.stages[k].label}: conserved energy"
     unit, key, values = PER_MOLECULE, DRIFT_PER_MOLECULE, drift / len(system.model.species)
     thermal = BOLTZMANN / KJ_PER_MOL * (stage.get("temperature_K") or 0.0)
@@ -214,7 +214,7 @@ def draw_panel(axis: "Axes", times: Timeline, panel: Panel) -> None:
         axis.set_yscale("log")
         axis.yaxis.set_major_formatter("{x:.0e}")
         axis.set_ylim(low / 2 or None, 2 * high or None)
-        if low == panel.zero:
+        if panel.zero is not None and low == panel.zero:
             _label_zero(axis, panel.zero)
     else:
         margin = 0.05 * (high - low)
@@ -265,7 +265,7 @@ def draw_rows(figure: "Picture", rows: Rows, area: Sequence[float]) -> "list[Axe
     return axes
 
 
-def _tick_text(value: float, _: int) -> str:
+def _tick_text(value: float, _: float) -> str:
     """A number at a tick, where neighbours such as 5e-05 and 0.0001 have one form."""
     text = f"{value:.6g}"
     if 1e-6 < abs(value) < 1e-4:
