@@ -27,7 +27,15 @@ from command_line import SMOKE, new_parser, read_options
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from rigidmd import Simulation, scene_from_atoms
 from rigidmd.features.calculators.calculator import CalculatorForce
-from rigidmd.features.view.figures.style import INK, new_figure, open_axis
+from rigidmd.features.view.figures.style import (
+    INK,
+    TEXT,
+    TITLE,
+    curve_style,
+    new_figure,
+    open_axis,
+    save_files,
+)
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 TEMPERATURE, DURATION, INTERVAL = 200.0, 0.024 if SMOKE else 2.0, 0.012  # K, ps, ps
@@ -97,23 +105,24 @@ def main() -> None:
     for step in FLEXIBLE:
         curves["flexible, ASE"].append((step, flexible(relaxed, step).std() / (54 * THERMAL)))
         print(f"flexible {step:5g} fs: {curves['flexible, ASE'][-1][1]:.2e}")
-    draw(curves, options.to / "calculator_steps.png")
+    draw(curves, options.to)
 
 
-def draw(curves: dict[str, list], path: Path) -> None:
+def draw(curves: dict[str, list], images: Path) -> None:
     """The error against the step."""
-    figure = new_figure(6.4, 3.8)
+    figure = new_figure(5.2, 3.2)
     axis = figure.subplots()
-    for (name, points), color in zip(curves.items(), ("#2b7fb8", "#c8553d"), strict=True):
-        axis.loglog(*np.array(points).T, "o-", ms=4, color=color, label=name)
-    axis.set_xlabel("time step, fs", color=INK)
-    axis.set_ylabel("error of the energy,\nkT per degree of freedom", color=INK)
+    for k, (name, points) in enumerate(curves.items()):
+        axis.loglog(*np.array(points).T, ms=4, lw=1.2, label=name, **curve_style(k))
+    axis.set_xlabel("time step (fs)", fontsize=TITLE, color=INK)
+    label = "rms energy error\n(kT per degree of freedom)"
+    axis.set_ylabel(label, fontsize=TITLE, color=INK)
     steps = sorted({*RIGID, *FLEXIBLE})
     axis.set_xticks(steps, [f"{step:g}" for step in steps])
     axis.minorticks_off()
-    axis.legend(frameon=False, labelcolor=INK)
-    open_axis(axis)
-    figure.savefig(path, dpi=110)
+    axis.legend(frameon=False, labelcolor=INK, fontsize=TEXT)
+    open_axis(axis, labelsize=TEXT)
+    save_files(figure, images / "calculator_steps", ["png"])
 
 
 if __name__ == "__main__":

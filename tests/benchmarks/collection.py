@@ -3,14 +3,16 @@ documentation.
 
     python tests/benchmarks/collection.py            # measures what is missing, half an hour; NAME ... only these
     python tests/benchmarks/collection.py --force    # measures again
-    python tests/benchmarks/collection.py --pages    # writes the page again, from the data
+    python tests/benchmarks/collection.py --pages    # draws the figures and writes the page, from the data
 
-writes evidence/data/collection/NAME.csv (all trials) and NAME.json (advice, versions, machine),
-images/collection_NAME.png and evidence/collection.md in rigidmd/docs, or the folder of --to.
+writes evidence/data/collection/NAME.json (what is fastest, versions, machine; of the scenes in figures
+also NAME.csv with all trials), images/collection_water.png, collection_top.png and error_time.png,
+and evidence/collection.md in rigidmd/docs, or the folder of --to.
 """
 
+import csv
 import json
-import shlex
+import shutil
 import sys
 from datetime import date
 from importlib.metadata import version
@@ -21,7 +23,19 @@ import numpy as np
 from command_line import SMOKE, new_parser, read_options
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+from rigidmd.core.integrators import SCHEMES
 from rigidmd.errors import RigidMDError
+from rigidmd.features.view.figures.style import (
+    DASHES,
+    INK,
+    TEXT,
+    TITLE,
+    curve_style,
+    label_ticks,
+    new_figure,
+    open_axis,
+    save_files,
+)
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "rigidmd" / "docs"
@@ -89,10 +103,15 @@ SCENES = {
 }
 
 
-def command_of(name: str) -> str:
-    _, file, settings = SCENES[name]
-    overrides = "".join(f" \\\n    --set {shlex.quote(setting)}" for setting in settings)
-    return f"rigidmd accuracy systems/{file}.toml --repeats {REPEATS}{overrides}"
+#: Figure of the page -> its scene; the scenes, titles and integrators of the figure of README.
+FIGURES = {"collection_water": "water_pme", "collection_top": "heavy_top_3"}
+README = (
+    ("water_pme", "216 SPC/E waters, PME, 0.1 ps", "kT per degree of freedom"),
+    ("heavy_top_3", "heavy top, 5 nutations", "/ largest kinetic energy"),
+)
+SHOWN = ("velocity_verlet", "srkn_4", "srkn_6")
+ERRORS = {"energy rms": "rms energy error", "error of Q": "error of Q"}
+SCATTER = 20.0  # %: curves are dashed where timings scatter more
 
 
 def data_of(docs: Path) -> Path:
@@ -146,11 +165,8 @@ def measure(name: str, docs: Path) -> None:
     }
     data = data_of(docs)
     data.mkdir(parents=True, exist_ok=True)
-    accuracy.trial_table(found).write(data / f"{name}.csv")
-    figure = accuracy.accuracy_figure(found)
-    figure.lay_out(100)
-    (docs / "images").mkdir(exist_ok=True)
-    figure.savefig(docs / "images" / f"collection_{name}.png", dpi=85)
+    if name in FIGURES.values():
+        accuracy.trial_table(found).write(data / f"{name}.csv")
     (data / f"{name}.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
 
 
@@ -175,28 +191,74 @@ def summary_row(name: str, facts: dict) -> list[str]:
             clear = common[0] * (1 - common[2] / 2) > time * (1 + spread / 2)
             factor = f", {common[0] / time:.1f} times" if clear else ", within the spread"
         cells.append(f"`{best}` at {step:.2g} {facts['unit']}{factor}")
-    return [f"[{name}](#{name})", *cells]
+    return [SCENES[name][0], *cells]
 
 
-def section_of(name: str, facts: dict) -> list[str]:
-    spread = f"{facts['median_spread']:.0%}"
-    return [
-        f"## {name}",
-        "",
-        f"This scene is {SCENES[name][0]}.",
-        "",
-        "<!-- test: not run, it takes minutes -->",
-        "```sh",
-        command_of(name),
-        "```",
-        "",
-        f"![{name}: error against run time](../images/collection_{name}.png)",
-        "",
-        f"The median spread of the {REPEATS} timings of a trial is {spread}. "
-        f"All trials: [{name}.csv](data/collection/{name}.csv). Longest steps, failures and "
-        f"what is fastest for other errors: [{name}.json](data/collection/{name}.json).",
-        "",
-    ]
+def trials_of(name: str, data: Path) -> dict[str, list[dict[str, float]]]:
+    """Integrator -> trials of a scene that have not failed, with the longest step first. A column
+    without a number has NaN."""
+    with (data / f"{name}.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    found: dict[str, list[dict[str, float]]] = {}
+    for row in rows:
+        integrator = row.pop("integrator")
+        if "fails" not in row.values():
+            values = {key.partition(" (")[0]: float(text or "nan") for key, text in row.items()}
+            found.setdefault(integrator, []).append(values)
+    return {name: sorted(of, key=lambda t: -t["step"]) for name, of in found.items()}
+
+
+def per_span(trial: dict[str, float], what: str) -> float:
+    """Force evaluations or seconds per ps or s."""
+    return next(value for key, value in trial.items() if key.startswith(f"{what} per "))
+
+
+def draw_scene(image: str, name: str, data: Path, images: Path) -> None:
+    """Errors against force evaluations, a curve for each integrator in the order of the step."""
+    figure = new_figure(7.2, 3.6)
+    axes = figure.subplots(1, 2)
+    unit = "ps" if name == "water_pme" else "s"
+    orders = {n: k for k, n in enumerate(SCHEMES)}
+    trials = dict(sorted(trials_of(name, data).items(), key=lambda e: orders.get(e[0], 99)))
+    for axis, (error, label) in zip(axes, ERRORS.items(), strict=True):
+        for k, (integrator, of) in enumerate(trials.items()):
+            points = [(per_span(t, "forces"), t[error]) for t in of if t[error] > 0]
+            if points:
+                axis.loglog(*np.array(points).T, ms=3, lw=1.0, label=integrator, **curve_style(k))
+        axis.set_ylabel(label, fontsize=TITLE, color=INK)
+        open_axis(axis, labelsize=TEXT)
+    figure.supxlabel(f"force evaluations per {unit}", fontsize=TITLE, color=INK)
+    style = {"frameon": False, "fontsize": TEXT, "labelcolor": INK, "handlelength": 2.6}
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", **style)
+    save_files(figure, images / image, ["png"])
+
+
+def draw_error_time(data: Path, images: Path) -> None:
+    """The figure of README: the error of the energy against run time, of water and of a top."""
+    figure = new_figure(6.0, 2.9)
+    axes = figure.subplots(1, 2)
+    for axis, (name, title, unit) in zip(axes, README, strict=True):
+        trials = trials_of(name, data)
+        for k, integrator in enumerate(SHOWN):
+            of = [t for t in trials.get(integrator, ()) if t["energy rms"] > 0]
+            x = np.array([1000 * per_span(t, "seconds") for t in of])
+            y = np.array([t["energy rms"] for t in of])
+            scatters = np.array([t["spread"] > SCATTER for t in of], bool)
+            label = f"{integrator} (default)" if k == 0 else integrator
+            axis.loglog(x, y, ms=4, label=label, **curve_style(k) | {"ls": "none"})
+            for i in range(len(of) - 1):
+                line = (0, DASHES[1]) if scatters[i : i + 2].any() else "-"
+                color = curve_style(k)["color"]
+                axis.loglog(x[i : i + 2], y[i : i + 2], lw=1.3, color=color, ls=line)
+        axis.set_title(title, loc="left", fontsize=TITLE, color=INK)
+        per = "ps" if name == "water_pme" else "s"
+        axis.set_xlabel(f"run time (ms per {per} of motion)", fontsize=TITLE, color=INK)
+        label = f"energy error /\n{unit[2:]}" if unit[0] == "/" else f"energy error\n({unit})"
+        axis.set_ylabel(label, fontsize=TITLE, color=INK)
+        open_axis(axis, labelsize=TEXT)
+        label_ticks(axis.xaxis)
+    axes[1].legend(frameon=False, fontsize=TEXT, labelcolor=INK, loc="lower left")
+    save_files(figure, images / "error_time", ["png"])
 
 
 def machines_of(found: dict[str, dict]) -> str:
@@ -218,43 +280,45 @@ def page_text(docs: Path = DOCS) -> str:
         if (data / f"{name}.json").is_file()
     }
     heads = [f"energy error of {target:.0e}" for target in TARGETS]
-    return (
-        "\n".join(
-            [
-                "# Collection",
-                "",
-                "Error against run time of every integrator in ten scenes: the fastest for three errors, and a figure of each scene.",
-                "",
-                "<!-- written by python tests/benchmarks/collection.py from data/collection; do not edit -->",
-                "",
-                "One command measures all scenes, draws the pictures and writes this page:",
-                "",
-                "<!-- test: not run, it takes half an hour -->",
-                "```sh",
-                "python tests/benchmarks/collection.py",
-                "```",
-                "",
-                "Each row has the fastest integrator for three errors of the energy, and how many times faster than",
-                "`velocity_verlet` it is at that error. The factor is absent where `velocity_verlet` is the fastest or does not reach the",
-                "error with its shortest step. The unit of the error is kT per degree of freedom for molecules, over 0.1 ps, and the",
-                "largest kinetic energy for a body, over its run. High orders need smooth forces, so all molecules have",
-                '`forces.truncation = "smooth_switch"`. The cost is the median of three timings on a shared machine, and the spread of',
-                "the timings is given below for each scene; a factor within it is not printed.",
-                "",
-                table(
-                    ["scene", *heads], [summary_row(name, facts) for name, facts in found.items()]
-                ),
-                "",
-                "Curves end at a floor, below which a shorter step does not reduce the error: the rounding error, or with PME the error",
-                "of the energy that the grid and the truncated real-space sum leave. A method at its floor shows no order.",
-                "",
-                machines_of(found),
-                "",
-                *(line for name, facts in found.items() for line in section_of(name, facts)),
-            ]
-        ).rstrip()
-        + "\n"
-    )
+    rows = [summary_row(name, facts) for name, facts in found.items()]
+    return PAGE.format(table=table(["scene", *heads], rows), machines=machines_of(found))
+
+
+PAGE = """# Collection
+
+Error against run time of every integrator in ten scenes: the fastest for three errors, and two figures.
+
+<!-- written by python tests/benchmarks/collection.py from data/collection; do not edit -->
+
+One command measures all scenes, draws the figures and writes this page:
+
+<!-- test: not run, it takes half an hour -->
+```sh
+python tests/benchmarks/collection.py
+```
+
+Each row has the fastest integrator for three errors of the energy, and how many times faster than
+`velocity_verlet` it is at that error. There is no factor where `velocity_verlet` is the fastest or does not reach the
+error with its shortest step. The unit is kT per degree of freedom for molecules, over 0.1 ps, and the largest kinetic
+energy for a body, over its run. High orders need smooth forces, so all molecules have
+`forces.truncation = "smooth_switch"`. The run time is the median of three timings on a shared machine; a factor within
+their spread is not printed.
+
+{table}
+
+The figures have the error against force evaluations, which do not depend on the machine, for water with PME and for the
+heavy top. Each curve joins the trials of an integrator in the order of the step.
+
+![error of integrators against force evaluations, water](../images/collection_water.png)
+
+![error of integrators against force evaluations, heavy top](../images/collection_top.png)
+
+A curve ends at a floor, where a shorter step does not reduce the error: the rounding error, or with PME the error
+of the grid and of the truncated real-space sum. There a method shows no order.
+
+{machines} Longest steps, failures and the fastest integrators for other errors are in
+`rigidmd/docs/evidence/data/collection`.
+"""
 
 
 def main() -> None:
@@ -274,6 +338,15 @@ def main() -> None:
                 if SMOKE:
                     raise
                 print(f"{name} failed: {error}")
+    data, images = data_of(docs), docs / "images"
+    if options.pages and docs != DOCS:
+        shutil.copytree(data_of(DOCS), data, dirs_exist_ok=True)
+    images.mkdir(exist_ok=True)
+    for image, name in FIGURES.items():
+        if (data / f"{name}.csv").is_file():
+            draw_scene(image, name, data, images)
+    if all((data / f"{name}.csv").is_file() for name, *_ in README):
+        draw_error_time(data, images)
     (docs / "evidence").mkdir(exist_ok=True)
     (docs / "evidence" / "collection.md").write_text(page_text(docs), encoding="utf-8")
 

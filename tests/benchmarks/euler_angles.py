@@ -11,8 +11,10 @@ import numpy as np
 from command_line import new_parser, read_options
 from matplotlib.figure import Figure
 
-INK, LAB, BODY = "#1f2430", "#2b6f9e", "#c8553d"
-ANGLES = {"phi": "#7a5ca3", "theta": "#4f8a5b", "psi": "#b8862d"}
+from rigidmd.features.view.figures.style import COOL, INK, PALETTE, WARM
+
+LAB, BODY = COOL, WARM
+ANGLES = {"phi": PALETTE["navy"], "theta": PALETTE["green"], "psi": PALETTE["amber"]}
 PHI, THETA, PSI = np.radians([40.0, 40.0, 52.0])
 X, Y, Z = np.eye(3)
 

@@ -18,15 +18,27 @@ from pathlib import Path
 
 import numpy as np
 from command_line import SMOKE, new_parser, read_options
+from matplotlib.ticker import NullFormatter
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from rigidmd import Scene, Simulation
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.features.bodies.trials import body_trial_system
-from rigidmd.features.view.figures.style import FAINT, INK, curve_style, new_figure, open_axis
+from rigidmd.features.view.figures.style import (
+    DASHES,
+    FAINT,
+    INK,
+    TEXT,
+    TITLE,
+    curve_style,
+    new_figure,
+    open_axis,
+    save_files,
+)
 from rigidmd.run.trial_systems import molecular_trial_system
 
 ROOT = Path(__file__).parents[2]
+DOCS, FILE = ROOT / "rigidmd" / "docs", "long_run.json"
 SMOKE_STEPS = 4000
 #: Name -> text of the legend, scene, overrides, integrator, rotor, time step (s or fs), steps.
 CASES = {
@@ -89,7 +101,7 @@ CASES = {
 QUANTITIES = {
     "L": "angular momentum, relative",
     "energy": "energy / kinetic energy",
-    "QTQ": "orthogonality, QQᵀ per entry",
+    "QTQ": "orthogonality, QᵀQ per entry",
 }
 #: Samples 10 steps from each other at the start, then evenly over the run.
 FINE, COARSE = (100, 100) if SMOKE else (1000, 20_000)
@@ -188,51 +200,41 @@ def fitted_slope(changes: list) -> float:
     )
 
 
-def draw(cases: dict, path: Path) -> None:
+#: Power of the number of steps, dashes and label of the lines of comparison.
+GROWTHS = ((0.5, DASHES[1], "random walk, √n"), (1.0, DASHES[2], "drift, n"))
+
+
+def draw(cases: dict, images: Path) -> None:
     """Root mean square change over steps, a panel for each quantity."""
-    figure = new_figure(11, 4.4)
-    axes = figure.subplots(1, 3)
+    figure = new_figure(7.2, 7.0)
+    axes = figure.subplots(3, 1, sharex=True)
     for axis, (quantity, title) in zip(axes, QUANTITIES.items(), strict=True):
         for k, name in enumerate(case for case in CASES if case in cases):
-            n, change = np.array(
-                [point for point in cases[name]["changes"].get(quantity, []) if point[1] > 0]
-                or [[np.nan] * 2]
-            ).T
+            points = [point for point in cases[name]["changes"].get(quantity, []) if point[1] > 0]
+            n, change = np.array(points or [[np.nan] * 2]).T
             axis.loglog(n, change, ms=2.5, lw=1.1, label=CASES[name][0], **curve_style(k))
-        axis.set_title(f"change of {title}", loc="left", fontsize=9, color=INK)
+        axis.set_title(f"change of {title}", loc="left", fontsize=TITLE, color=INK)
         axis.set_xlim(10, 1e8)
-        limits = axis.get_ylim()
+        low, high = axis.get_ylim()
         n = np.array([1e1, 1e8])
-        for power, text in ((0.5, "√n"), (1.0, "n")):
-            axis.loglog(n, 1e-16 * (n / 10) ** power, "--", color=FAINT, lw=0.9)
-            axis.annotate(
-                text,
-                (1e5, 1e-16 * 1e4**power),
-                xytext=(2, -9),
-                textcoords="offset points",
-                color=FAINT,
-                fontsize=9,
-            )
-        axis.set_xlabel("steps n", color=INK, fontsize=9)
-        axis.set_ylim(limits)
-        open_axis(axis)
-    handles, labels = axes[0].get_legend_handles_labels()
+        for power, dashes, label in GROWTHS if quantity != "QTQ" else ():
+            line = 3 * low * (n / 10) ** power
+            axis.loglog(n, line, color=FAINT, lw=0.9, ls=(0, dashes), label=label)
+        axis.set_ylim(*((1e-16, 1e-14) if quantity == "QTQ" else (low, high)))
+        axis.yaxis.set_minor_formatter(NullFormatter())
+        open_axis(axis, labelsize=TEXT)
+    axes[-1].set_xlabel("steps n", color=INK, fontsize=TITLE)
+    style = {"frameon": False, "fontsize": TEXT, "labelcolor": INK, "handlelength": 2.8}
     figure.legend(
-        handles,
-        labels,
-        frameon=False,
-        fontsize=8,
-        loc="outside lower center",
-        ncols=4,
-        labelcolor=INK,
+        *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, **style
     )
-    figure.savefig(path, dpi=110)
+    save_files(figure, images / "long_run", ["png"])
 
 
 def table(cases: dict) -> str:
     """Slopes and changes over the whole run, and the plateau of the orthogonality, in Markdown."""
     lines = [
-        "| run | steps | L: slope | in all | energy: slope | in all | QQᵀ: plateau |",
+        "| run | steps | L: slope | in all | energy: slope | in all | QᵀQ: plateau |",
         "|" + "---|" * 7,
     ]
     for name in (case for case in CASES if case in cases):
@@ -250,10 +252,10 @@ def main() -> None:
     """Run the cases, draw and print all."""
     parser = new_parser(__doc__)
     parser.add_argument("cases", nargs="*", metavar="CASE", help=", ".join(CASES))
-    options = read_options(parser, ROOT / "rigidmd" / "docs", cases=list(CASES))
-    data, image = options.to / "evidence/data/long_run.json", options.to / "images/long_run.png"
-    for file in (data, image):
-        file.parent.mkdir(parents=True, exist_ok=True)
+    options = read_options(parser, DOCS, cases=list(CASES))
+    data, images = options.to / "evidence" / "data" / FILE, options.to / "images"
+    for folder in (data.parent, images):
+        folder.mkdir(parents=True, exist_ok=True)
     for name in options.cases:
         found = run(name)
         cases = json.loads(data.read_text()) if data.is_file() else {}
@@ -263,8 +265,8 @@ def main() -> None:
             .replace("\n   ]", "]")
             + "\n"
         )
-    cases = json.loads(data.read_text())
-    draw(cases, image)
+    cases = json.loads((data if data.is_file() else DOCS / "evidence" / "data" / FILE).read_text())
+    draw(cases, images)
     print(table(cases))
 
 

@@ -61,7 +61,7 @@ from rigidmd import Scene, Simulation
 from rigidmd.assemble.build import build
 from rigidmd.compile.cache import cache_folder
 from rigidmd.core.statistics import slope
-from rigidmd.features.view.figures.style import FAINT, INK
+from rigidmd.features.view.figures.style import FAINT, INK, PALETTE
 from rigidmd.forces.ewald.corrections import intramolecular_energy
 from rigidmd.mechanics.rotation import align
 from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
@@ -292,17 +292,17 @@ class Curve:
 
 
 CURVES = (
-    Curve("rigidmd velocity_verlet", "rigidmd", "#123d5c", {"integrator": "velocity_verlet"}),
+    Curve("rigidmd velocity_verlet", "rigidmd", PALETTE["navy"], {"integrator": "velocity_verlet"}),
     Curve(
         "rigidmd velocity_verlet, mixed",
         "rigidmd",
-        "#2b7fb8",
+        PALETTE["cool"],
         {"integrator": "velocity_verlet", "precision": "mixed"},
     ),
     Curve(
         "rigidmd two_stage, mixed",
         "rigidmd",
-        "#8fb4cf",
+        PALETTE["cyan"],
         {"integrator": "two_stage", "precision": "mixed"},
         stretch=2,
         timed=False,
@@ -310,26 +310,28 @@ CURVES = (
     Curve(
         "rigidmd srkn_4, smooth_switch",
         "rigidmd",
-        "#b8862d",
+        PALETTE["amber"],
         {"integrator": "srkn_4", "truncation": "smooth_switch"},
         "smooth_switch",
         "RF smooth",
         stretch=3,
         timed=False,
     ),
-    Curve("GROMACS, buffer tolerance 0.005 (default)", "gromacs", "#e2a08f", {"buffer": 0.005}),
-    Curve("GROMACS, buffer tolerance 1e-5", "gromacs", "#c8553d", {"buffer": 1e-5}),
-    Curve("OpenMM", "openmm", "#9bbf9f", {}, "plain", "RF without self"),
+    Curve(
+        "GROMACS, buffer tolerance 0.005 (default)", "gromacs", PALETTE["violet"], {"buffer": 0.005}
+    ),
+    Curve("GROMACS, buffer tolerance 1e-5", "gromacs", PALETTE["warm"], {"buffer": 1e-5}),
+    Curve("OpenMM", "openmm", PALETTE["green"], {}, "plain", "RF without self"),
     Curve(
         "OpenMM, switched",
         "openmm",
-        "#4f8a5b",
+        INK,
         {"switch_A": SWITCH},
         "switch",
         "RF without self",
         timed=False,
     ),
-    Curve("LAMMPS", "lammps", "#7a5ca3", {"skin_A": 2.0}, coulomb="DSF"),
+    Curve("LAMMPS", "lammps", FAINT, {"skin_A": 2.0}, coulomb="DSF"),
 )
 
 

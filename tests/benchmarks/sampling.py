@@ -57,7 +57,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from rigidmd import Every, Scene, Simulation
 from rigidmd.errors import RigidMDError
 from rigidmd.features.studies.extrapolation import MeanAtStep, extrapolate
-from rigidmd.features.view.figures.style import FAINT, INK
+from rigidmd.features.view.figures.style import FAINT, INK, PALETTE
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 COUNT = 343 if SMOKE else 512
@@ -113,33 +113,37 @@ RESCALING, LANGEVIN, HYBRID = (
 )
 METHODS = {
     "velocity_verlet + velocity_rescaling": Method(
-        "rigidmd", "#2b7fb8", (1, 2, 4, 6, 8), (2, 4), RESCALING | {"integrator": "velocity_verlet"}
+        "rigidmd",
+        PALETTE["cool"],
+        (1, 2, 4, 6, 8),
+        (2, 4),
+        RESCALING | {"integrator": "velocity_verlet"},
     ),
     "velocity_verlet + nose_hoover": Method(
         "rigidmd",
-        "#8fb4cf",
+        PALETTE["cyan"],
         (4, 8),
         (),
         {"integrator": "velocity_verlet", "thermostat": "nose_hoover"},
     ),
     "baoab + velocity_rescaling": Method(
-        "rigidmd", "#123d5c", (2, 4, 8), (4, 8), RESCALING | {"integrator": "baoab"}
+        "rigidmd", PALETTE["navy"], (2, 4, 8), (4, 8), RESCALING | {"integrator": "baoab"}
     ),
     "baoab + langevin": Method(
-        "rigidmd", "#b8862d", (2, 4, 8), (4, 8), LANGEVIN | {"integrator": "baoab"}, False
+        "rigidmd", PALETTE["amber"], (2, 4, 8), (4, 8), LANGEVIN | {"integrator": "baoab"}, False
     ),
     "srkn_4 + velocity_rescaling": Method(
-        "rigidmd", "#7a5ca3", (8,), (), RESCALING | {"integrator": "srkn_4"}
+        "rigidmd", PALETTE["violet"], (8,), (), RESCALING | {"integrator": "srkn_4"}
     ),
     "velocity_verlet + hybrid_monte_carlo": Method(
-        "rigidmd", "#5aa79b", (2, 4), (), HYBRID | {"integrator": "velocity_verlet"}, False
+        "rigidmd", PALETTE["green"], (2, 4), (), HYBRID | {"integrator": "velocity_verlet"}, False
     ),
     "two_stage + hybrid_monte_carlo": Method(
-        "rigidmd", "#1f6f63", (4, 8), (4,), HYBRID | {"integrator": "two_stage"}, False
+        "rigidmd", INK, (4, 8), (4,), HYBRID | {"integrator": "two_stage"}, False
     ),
     "GROMACS md + v-rescale": Method(
         "gromacs",
-        "#c8553d",
+        PALETTE["warm"],
         (1, 2, 4, 8),
         (2, 4),
         {
@@ -152,13 +156,13 @@ METHODS = {
     ),
     "GROMACS sd": Method(
         "gromacs",
-        "#e2a08f",
+        FAINT,
         (2, 4, 8),
         (),
         {"integrator": "sd", "tc-grps": "system", "tau-t": 1.0, "ref-t": TEMPERATURE},
         False,
     ),
-    "OpenMM LangevinMiddle": Method("openmm", "#4f8a5b", (1, 2, 4, 8), (4,), {}, False),
+    "OpenMM LangevinMiddle": Method("openmm", "black", (1, 2, 4, 8), (4,), {}, False),
 }
 
 

@@ -8,7 +8,9 @@ of 216 waters that has come to rest is copied along each edge, so every size is 
 Each size runs in a process of its own, so that its peak of memory is its own. The start is the time
 from the state on disk to the end of the first step. Lists are built before the clock of the steps
 starts, and rebuilt while it runs. No variable about threads is set: it is measured as users have
-it. The figure is FOLDER/scaling.png.
+it. The rows are FOLDER/scaling.json, the figure FOLDER/scaling.png.
+
+    python tests/benchmarks/scaling.py --draw          # only the figure, from data of the documentation
 """
 
 import json
@@ -21,8 +23,7 @@ from argparse import SUPPRESS
 from pathlib import Path
 
 import numpy as np
-from command_line import SMOKE, SMOKE_OPTION, new_parser, numbers, read_options
-from matplotlib.figure import Figure
+from command_line import SMOKE, SMOKE_OPTION, new_parser, numbers, read_options, shown
 from peer_engines import environment
 from peers import WORKLOADS, write_start
 
@@ -31,8 +32,20 @@ from rigidmd import Scene, Simulation
 from rigidmd.assemble.memory_check import array_bytes
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.state import NOW
+from rigidmd.features.view.figures.style import (
+    COLORS,
+    COOL,
+    INK,
+    MARKERS,
+    TEXT,
+    TITLE,
+    new_figure,
+    open_axis,
+    save_files,
+)
 
 WORK = WORKLOADS["W1"]
+DATA = Path(__file__).parents[2] / "rigidmd" / "docs" / "evidence" / "data" / "scaling.json"
 UNIT = 216  # molecules in the box that is copied, whose edge is little more than twice the cutoff
 EDGE = WORK.edge * (UNIT / WORK.count) ** (1 / 3)  # Å
 STEP = 2e-3  # ps
@@ -121,26 +134,28 @@ def measure(job: dict) -> dict:
     }
 
 
-def draw(rows: list[dict], cores: list[int], path: Path) -> None:
-    """Time and memory of a molecule against their number."""
-    figure = Figure(figsize=(8, 3.2), layout="constrained")
+def draw(rows: list[dict], cores: list[int], images: Path) -> None:
+    """Time and memory per molecule against their number."""
+    figure = new_figure(7.2, 2.9)
     time_axis, memory_axis = figure.subplots(1, 2)
     count = [row["molecules"] for row in rows]
-    for k, color in zip(cores, ("#1f5fa8", "#c4472b", "#4c8c4a", "#8a5aa8"), strict=False):
-        cost = [1e6 * row["seconds"][str(k)] / row["molecules"] for row in rows]
-        time_axis.plot(count, cost, "o-", color=color, label=f"{k} core{'s' * (k > 1)}")
-    time_axis.set_ylabel("µs a molecule and step")
-    time_axis.legend(frameon=False)
-    memory_axis.plot(
-        count, [row["arrays"] / row["molecules"] / 1e3 for row in rows], "o-", color="#5c6270"
-    )
-    memory_axis.set_ylabel("kB of arrays a molecule")
+    for k, (number, color) in enumerate(zip(cores, COLORS, strict=False)):
+        cost = [1e6 * row["seconds"][str(number)] / row["molecules"] for row in rows]
+        label = f"{number} core{'s' * (number > 1)}"
+        time_axis.plot(count, cost, marker=MARKERS[k], ms=4, lw=1.2, color=color, label=label)
+    time_axis.set_ylabel("µs per molecule and step")
+    time_axis.legend(frameon=False, fontsize=TEXT, labelcolor=INK)
+    memory = [row["arrays"] / row["molecules"] / 1e3 for row in rows]
+    memory_axis.plot(count, memory, "o-", ms=4, lw=1.2, color=COOL)
+    memory_axis.set_ylabel("kB of arrays per molecule")
     for axis in (time_axis, memory_axis):
         axis.set_xscale("log")
         axis.set_ylim(0, 1.1 * axis.dataLim.ymax)
-        axis.set_xlabel("SPC/E molecules, cut-off 9 Å")
-        axis.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=150)
+        axis.set_xlabel("SPC/E molecules, cutoff 9 Å")
+        open_axis(axis, labelsize=TEXT)
+        for label in (axis.xaxis.label, axis.yaxis.label):
+            label.set(fontsize=TITLE, color=INK)
+    save_files(figure, images / "scaling", ["png"])
 
 
 def main() -> None:
@@ -151,18 +166,23 @@ def main() -> None:
     )
     parser.add_argument("--cores", type=numbers(int), default=[1, 2], help="1,2")
     parser.add_argument("--precision", choices=("double", "mixed"), default="mixed")
+    parser.add_argument("--draw", action="store_true", help=f"only draw {shown(DATA)}")
     parser.add_argument("--job", help=SUPPRESS)
     asked = read_options(parser, Path("runs/scaling"), copies=[1, 2], cores=[1])
     if asked.job:
         print(json.dumps(measure(json.loads(asked.job))))
         return
+    if asked.draw:
+        rows = json.loads(DATA.read_text(encoding="utf-8"))
+        draw(rows, list(map(int, rows[0]["seconds"])), asked.to)
+        return
     with tempfile.TemporaryDirectory() as folder:
         relax(Path(folder))
         per_step = "".join(
-            f" µs a molecule and step, {k} core{'s' * (k > 1)} |" for k in asked.cores
+            f" µs per molecule and step, {k} core{'s' * (k > 1)} |" for k in asked.cores
         )
         print(
-            f"| molecules | start, s |{per_step} steps/s | arrays, kB a molecule | peak of the process, GB |"
+            f"| molecules | start, s |{per_step} steps/s | arrays, kB per molecule | peak of the process, GB |"
         )
         print("|---" * (5 + len(asked.cores)) + "|", flush=True)
         rows = []
@@ -186,7 +206,8 @@ def main() -> None:
                 f"| {n:,} | {found['start']:.1f} |{costs} {rate:.3g} | {found['arrays'] / n / 1e3:.2f} | {found['peak'] / 1e9:.2f} |",
                 flush=True,
             )
-    draw(rows, asked.cores, asked.to / "scaling.png")
+    (asked.to / DATA.name).write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    draw(rows, asked.cores, asked.to)
 
 
 if __name__ == "__main__":

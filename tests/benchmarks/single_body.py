@@ -2,6 +2,7 @@
 alternating in one run.
 
     python tests/benchmarks/single_body.py
+    python tests/benchmarks/single_body.py --draw      # only the figure and the table, from data of the documentation
 
 writes evidence/data/single_body.csv and images/single_body.png in rigidmd/docs, or the folder of
 --to, and prints the table of the benchmarks. The top is that of systems/heavy_top_3.toml for 20 nutations; the error is that of Q at
@@ -17,7 +18,7 @@ from pathlib import Path
 from statistics import median
 
 import numpy as np
-from command_line import SMOKE, new_parser, read_options
+from command_line import SMOKE, new_parser, read_options, shown
 from scipy.integrate import solve_ivp
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -26,14 +27,24 @@ from support import known
 
 from rigidmd.core.integrators import SCHEMES, Solver
 from rigidmd.features.bodies.ode.engine import OdeEngine
+from rigidmd.features.view.figures.style import (
+    INK,
+    TEXT,
+    TITLE,
+    curve_style,
+    new_figure,
+    open_axis,
+    save_files,
+)
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "rigidmd" / "docs"
+DATA, FILE = DOCS / "evidence" / "data", "single_body.csv"
 NUTATIONS, REPEATS = (2, 1) if SMOKE else (20, 5)
 SPEED_STEPS = 1000 if SMOKE else 1_000_000
-STEPS = {  # a nutation
+STEPS = {  # per nutation
     "velocity_verlet": (60, 100, 300, 1000, 3000, 10000, 30000, 100000),
     "suzuki_4": (10, 15, 30, 60, 120, 250, 500, 1000),
     "kahan_li_6": (6, 8, 11, 16, 25, 40, 60, 100, 160),
@@ -42,14 +53,25 @@ STEPS = {  # a nutation
     "srkn_6": (4, 6, 8, 11, 16, 22, 32, 45, 64),
 }
 TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12, 1e-13)
-PYTHON, COMPILED = "DOP853, slopes in Python", "DOP853 through this engine"
+PYTHON, COMPILED = "DOP853 of SciPy", "dop853 of rigidmd"
 
 
 def main():
-    folder = read_options(new_parser(__doc__), DOCS).to
-    data, images = folder / "evidence" / "data", folder / "images"
+    parser = new_parser(__doc__)
+    parser.add_argument("--draw", action="store_true", help=f"only draw {shown(DATA / FILE)}")
+    options = read_options(parser, DOCS)
+    data, images = options.to / "evidence" / "data", options.to / "images"
     for one in (data, images):
         one.mkdir(parents=True, exist_ok=True)
+    if options.draw:
+        with (DATA / FILE).open(newline="") as file:
+            _, *lines = csv.reader(file)
+        rows = [
+            (name, setting, float(spent), float(error)) for name, setting, spent, error in lines
+        ]
+        table(rows)
+        draw(rows, images)
+        return
     scene = Scene.read(ROOT / "systems" / "heavy_top_3.toml", {"output.trajectory": False})
     system = Simulation(scene).system
     i1, _, i3 = (float(x) for x in system.inertia)
@@ -117,10 +139,10 @@ def main():
         (name, setting, median(seconds[name, setting]), errors[name, setting])
         for name, setting, _ in cases
     ]
-    with (data / "single_body.csv").open("w", newline="") as file:
+    with (data / FILE).open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(
-            ["method", "steps a nutation or tolerance", "seconds", "error of Q at the end"]
+            ["method", "steps per nutation or tolerance", "seconds", "error of Q at the end"]
         )
         writer.writerows(rows)
     speed(system, start, top)
@@ -166,7 +188,7 @@ def table(rows):
     """Times at equal error, and how many times faster the best of the engine's integrators is."""
     own, python, compiled = (curve(rows, names) for names in (tuple(STEPS), (PYTHON,), (COMPILED,)))
     print(
-        "| error of Q | best integrator here | DOP853, slopes in Python | ratio | DOP853 through this engine | ratio |\n|---|---|---|---|---|---|"
+        "| error of Q | best integrator here | DOP853 of SciPy | ratio | dop853 of rigidmd | ratio |\n|---|---|---|---|---|---|"
     )
     for error in (1e-4, 1e-6, 1e-8, 1e-10):
         best = min(
@@ -181,37 +203,17 @@ def table(rows):
 
 def draw(rows, images):
     """Log error against log run time."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.5, 5), layout="constrained")
+    figure = new_figure(7.2, 4.0)
     axis = figure.subplots()
-    colors = dict(
-        zip(
-            [*STEPS, PYTHON, COMPILED],
-            [
-                "#8fb4cf",
-                "#5a93bb",
-                "#2b6f9e",
-                "#123d5c",
-                "#9bbf9f",
-                "#4f8a5b",
-                "#c8553d",
-                "#e2a08f",
-            ],
-            strict=True,
-        )
-    )
-    for name, color in colors.items():
-        errors, spent = zip(
-            *[(error, spent) for method, _, spent, error in rows if method == name], strict=True
-        )
-        axis.loglog(spent, errors, "o-", ms=4, lw=1.3, color=color, label=name.replace("_", " "))
-    axis.set_xlabel("seconds")
-    axis.set_ylabel("error of Q after 20 nutations")
-    axis.set_title("a heavy top: error against run time", loc="left", fontsize=11)
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.legend(frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0.4, 0.0))
-    figure.savefig(images / "single_body.png", dpi=150)
+    for k, name in enumerate([*STEPS, PYTHON, COMPILED]):
+        spent, errors = np.array([row[2:] for row in rows if row[0] == name], float).T
+        axis.loglog(spent, errors, ms=3.5, lw=1.2, label=name, **curve_style(k))
+    axis.set_xlabel("run time (s)", fontsize=TITLE, color=INK)
+    axis.set_ylabel("error of Q after 20 nutations", fontsize=TITLE, color=INK)
+    style = {"frameon": False, "fontsize": TEXT, "labelcolor": INK, "handlelength": 2.8}
+    figure.legend(loc="outside right center", **style)
+    open_axis(axis, labelsize=TEXT)
+    save_files(figure, images / "single_body", ["png"])
 
 
 if __name__ == "__main__":

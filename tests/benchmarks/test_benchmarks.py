@@ -11,6 +11,7 @@ import sys
 
 import pytest
 from support.common import ROOT
+from support.page_figures import FIGURES, redraw
 from support.processes import search_path
 
 FOLDER = ROOT / "tests" / "benchmarks"
@@ -108,6 +109,19 @@ def test_the_commands_on_pages_have_options_that_exist(parse):
     assert len(named) > 20
     for script, arguments in named:
         parse(script, arguments)
+
+
+def test_the_commands_of_figures_have_options_that_exist(parse):
+    for drawing in FIGURES.values():
+        script, *arguments = shlex.split(drawing.command)
+        parse(f"tests/benchmarks/{script}", [*arguments, "--to", "figures"])
+
+
+def test_figures_from_data_are_drawn_into_a_folder_and_those_that_change_are_listed(tmp_path):
+    wanted = {name for name, one in FIGURES.items() if one.seconds <= 3}
+    assert {*redraw(3, tmp_path)} == wanted == {path.name for path in tmp_path.iterdir()}
+    (tmp_path / "scaling.png").write_bytes(b"")
+    assert redraw(3, tmp_path) == ["scaling.png"]
 
 
 def test_an_option_that_does_not_exist_is_found(parse):

@@ -12,11 +12,19 @@ from pathlib import Path
 from typing import NamedTuple
 
 from command_line import SMOKE, new_parser, read_options
-from matplotlib.figure import Figure
 
 from rigidmd import Results, Scene, Simulation, read_run
 from rigidmd.errors import OutputError
-from rigidmd.features.view.figures.style import INK, PALETTE
+from rigidmd.features.view.figures.style import (
+    FAINT,
+    INK,
+    PALETTE,
+    TEXT,
+    TITLE,
+    new_figure,
+    open_axis,
+    save_files,
+)
 
 #: U of Monte Carlo (kJ/mol) and its error: NIST SRSW, 17 windows about 267 molecules, by a parabola.
 MONTE_CARLO = (-46.728, 0.003)
@@ -100,13 +108,15 @@ def point(method: str, step: float, results: Results) -> Point:
     return Point(method, step, float(time[-1]) / 1000, raw, at_zero)
 
 
-def draw(points: list[Point], image: Path) -> None:
+def draw(points: list[Point], images: Path) -> None:
     """U against the square of the step; lines lead to the value at zero from the same run. On the right
     the part about zero."""
-    figure = Figure(figsize=(9, 3.8), layout="constrained")
+    figure = new_figure(7.2, 3.6)
     value, error = MONTE_CARLO
     for axis, limits in zip(figure.subplots(1, 2), (None, (-46.79, -46.66)), strict=True):
-        axis.axhspan(value - error, value + error, color="#c9ced6", label="Monte Carlo (NIST)")
+        axis.axhspan(
+            value - error, value + error, color=FAINT, alpha=0.3, lw=0, label="Monte Carlo (NIST)"
+        )
         for name, method in METHODS.items():
             of = [at for at in points if at.method == name]
             style = {"color": method.color, "ls": "none", "capsize": 2.5, "ms": 5}
@@ -120,11 +130,13 @@ def draw(points: list[Point], image: Path) -> None:
                     axis.errorbar(place, *at.at_zero, marker="D", mfc="none", label=label, **style)
                     ends = (square, place), (at.raw[0], at.at_zero[0])
                     axis.plot(*ends, color=method.color, lw=0.7, ls=":")
-        axis.set(xlabel="dt² (fs²)", ylim=limits)
-        axis.tick_params(colors=INK, labelsize=8)
-    figure.axes[0].set_ylabel("U (kJ/mol per molecule)")
-    figure.axes[0].legend(fontsize=7.5, frameon=False, loc="upper left")
-    figure.savefig(image, dpi=130)
+        axis.set_ylim(limits)
+        axis.set_xlabel("Δt² (fs²)", fontsize=TITLE, color=INK)
+        open_axis(axis, labelsize=TEXT)
+    axis = figure.axes[0]
+    axis.set_ylabel("U (kJ/mol per molecule)", fontsize=TITLE, color=INK)
+    axis.legend(fontsize=TEXT, frameon=False, loc="upper left", labelcolor=INK)
+    save_files(figure, images / "zero_step", ["png"])
 
 
 def main() -> None:
@@ -151,7 +163,7 @@ def main() -> None:
             added = at.raw[0] - at.at_zero[0]
             text += f"   {added:+.4f}              {at.at_zero[0]:.4f} ± {at.at_zero[1]:.4f}"
         print(text)
-    draw(points, options.to / "zero_step.png")
+    draw(points, options.to)
 
 
 if __name__ == "__main__":

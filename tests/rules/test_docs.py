@@ -32,6 +32,7 @@ from support.documents import (
     pattern_of,
     write_files,
 )
+from support.page_figures import FIGURES, SCRIPTS
 
 from rigidmd.commands import cli
 from rigidmd.commands.arguments import read_scene
@@ -529,6 +530,17 @@ def contents_text() -> str:
             path = Path(os.path.relpath(PAGES[name], PAGES["contents"].parent)).as_posix()
             lines.append(f"- [{heading.removeprefix('# ')}]({path}): {about[0].lower()}{about[1:]}")
     return "\n".join(lines) + "\n"
+
+
+def test_every_picture_is_shown_and_drawn_by_a_command():
+    """Scripts are files whose command line is read by `tests/benchmarks/test_benchmarks.py`."""
+    there = {path.name for path in (DOCS / "images").iterdir()}
+    assert there == {*FIGURES}
+    text = "".join(path.read_text("utf-8") for path in (ROOT / "README.md", *DOCS.rglob("*.md")))
+    assert [name for name in sorted(there) if f"images/{name}" not in text] == []
+    for drawing in FIGURES.values():
+        assert (SCRIPTS / drawing.command.split()[0]).is_file()
+        assert drawing.source in ("data", "runs")
 
 
 def test_readme_is_a_first_page_and_leads_to_the_list_of_all():
