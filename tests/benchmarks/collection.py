@@ -298,8 +298,8 @@ python tests/benchmarks/collection.py
 ```
 
 Each row has the fastest integrator for three errors of the energy, and how many times faster than
-`velocity_verlet` it is at that error. There is no factor where `velocity_verlet` is the fastest or does not reach the
-error with its shortest step. The unit is kT per degree of freedom for molecules, over 0.1 ps, and the largest kinetic
+`velocity_verlet` it is at that error. The factor is left out where `velocity_verlet` is the fastest or does not reach
+the error with its shortest step. The unit is kT per degree of freedom for molecules, over 0.1 ps, and the largest kinetic
 energy for a body, over its run. High orders need smooth forces, so all molecules have
 `forces.truncation = "smooth_switch"`. The run time is the median of three timings on a shared machine; a factor within
 their spread is not printed.

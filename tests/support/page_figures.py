@@ -8,6 +8,7 @@ The script lists the images that changed.
 """
 
 import argparse
+import os
 import shlex
 import shutil
 import subprocess
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from support.common import ROOT
+from support.processes import search_path
 
 IMAGES = ROOT / "rigidmd" / "docs" / "images"
 SCRIPTS = ROOT / "tests" / "benchmarks"
@@ -66,7 +68,8 @@ def redraw(limit: float, images: Path = IMAGES) -> list[str]:
         script, *arguments = shlex.split(command)
         with tempfile.TemporaryDirectory() as folder:
             call = [sys.executable, str(SCRIPTS / script), *arguments, "--to", folder]
-            subprocess.run(call, check=True, stdout=subprocess.DEVNULL)
+            environment = os.environ | search_path(SCRIPTS)
+            subprocess.run(call, check=True, stdout=subprocess.DEVNULL, env=environment)
             drawn = {path.name: path for path in Path(folder).rglob("*")}
             for name in (name for name, one in FIGURES.items() if one.command == command):
                 old = images / name
