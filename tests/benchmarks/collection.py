@@ -235,7 +235,7 @@ def draw_scene(image: str, name: str, data: Path, images: Path) -> None:
 
 def draw_error_time(data: Path, images: Path) -> None:
     """The figure of README: the error of the energy against run time, of water and of a top."""
-    figure = new_figure(6.0, 2.9)
+    figure = new_figure(6.0, 3.0)
     axes = figure.subplots(1, 2)
     for axis, (name, title, unit) in zip(axes, README, strict=True):
         trials = trials_of(name, data)
@@ -257,7 +257,10 @@ def draw_error_time(data: Path, images: Path) -> None:
         axis.set_ylabel(label, fontsize=TITLE, color=INK)
         open_axis(axis, labelsize=TEXT)
         label_ticks(axis.xaxis)
-    axes[1].legend(frameon=False, fontsize=TEXT, labelcolor=INK, loc="lower left")
+    style = {"frameon": False, "fontsize": TEXT, "labelcolor": INK}
+    figure.legend(
+        *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, **style
+    )
     save_files(figure, images / "error_time", ["png"])
 
 

@@ -240,7 +240,18 @@ class AnalysisResult(Displayed):
         return curves_figure(self.curves, self.about)
 
     def title_of(self, curve: Curve) -> str:
-        """The title of the figure of one of its curves."""
+        """The title of the figure of one of its curves.
+
+        Parameters
+        ----------
+        curve : Curve
+            One of `curves`
+
+        Returns
+        -------
+        str
+            What the analysis is, or of several curves the label of this one
+        """
         return self.about if len(self.curves) == 1 else curve.label.partition(" (")[0]
 
     def to_dataframe(self, curve: str = "") -> "pandas.DataFrame":
