@@ -72,6 +72,9 @@ CHAPTERS = {
 }
 
 
+BEST = 3  # pages with a word that are shown with their subjects
+
+
 class Example(NamedTuple):
     """A shipped scene, notebook or script."""
 
@@ -170,23 +173,32 @@ def contents() -> dict[str, dict[str, str]]:
 
 
 def chapter_text(name: str) -> str:
-    """A chapter as plain text, without comments. Pictures become name and path. Raises
-    InputError."""
-    if name not in CHAPTERS:
-        word = re.compile(rf"\b{re.escape(name)}", re.IGNORECASE)
-        occurrences = {
-            chapter: len(word.findall(_plain(chapter)))
-            for chapter in CHAPTERS
-            if chapter != "changelog"
-        }
-        named = [f"{chapter} ({count})" for chapter, count in occurrences.items() if count]
-        where = (
-            f"the word is in {', '.join(named)}" if named else f"there are {', '.join(CHAPTERS)}"
-        )
+    """A chapter as plain text, without comments, or the chapters that contain a word. Pictures
+    become name and path. Raises InputError."""
+    if name in CHAPTERS:
+        return _plain(name)
+    counts = _pages_with(name)
+    if not counts:
+        hint = did_you_mean(name, CHAPTERS) or ";"
         raise InputError(
-            "help", [f"unknown chapter {name!r}{did_you_mean(name, CHAPTERS) or ';'} {where}"]
+            "help", [f"no page is or contains {name!r}{hint} `rigidmd help` lists all"]
         )
-    return _plain(name)
+    subjects = {page: about for pages in contents().values() for page, about in pages.items()}
+    best, others = list(counts)[:BEST], list(counts)[BEST:]
+    lines = [f"pages that contain the word: {len(counts)}"]
+    lines += [f"  {page} ({counts[page]}): {subjects[page]}" for page in best]
+    named = ", ".join(f"{page} ({counts[page]})" for page in others)
+    lines += [textwrap.fill(named, 98, initial_indent="  ", subsequent_indent="  ")] * bool(others)
+    return "\n".join([*lines, f"`rigidmd help {best[0]}` prints the first"])
+
+
+def _pages_with(word: str) -> dict[str, int]:
+    """How often the chapters have a word, most often first."""
+    pattern = re.compile(rf"\b{re.escape(word)}", re.IGNORECASE)
+    searched = [chapter for chapter in CHAPTERS if chapter not in ("changelog", "contents")]
+    counts = {chapter: len(pattern.findall(_plain(chapter))) for chapter in searched}
+    found = [chapter for chapter in searched if counts[chapter]]
+    return {chapter: counts[chapter] for chapter in sorted(found, key=lambda c: -counts[c])}
 
 
 def _plain(name: str) -> str:

@@ -618,7 +618,7 @@ def test_help_lists_and_prints_the_chapters(capsys):
     ("name", "expected"),
     [
         ("commandes", "did you mean commands?"),
-        ("qqq", "there are installation, five_minutes, why, contents, water, top"),
+        ("qqq", "no page is or contains 'qqq'; `rigidmd help` lists all"),
     ],
 )
 def test_a_chapter_that_is_not_there(name, expected, capsys):
