@@ -7,6 +7,7 @@ code gets the exception.
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from math import inf
 from pathlib import Path
 
 #: Characters that a terminal interprets instead of showing: control characters except tab and line
@@ -74,6 +75,12 @@ class RigidMDError(Exception):
         super().__init__(visible(message))
 
 
+def _line(message: str) -> float:
+    """The line of a file that a message begins with. Infinite without one."""
+    match = re.match(r"line (\d+): ", message)
+    return int(match[1]) if match else inf
+
+
 class InputError(RigidMDError):
     """Bad input, with all errors found.
 
@@ -82,12 +89,12 @@ class InputError(RigidMDError):
     where
         What was read, usually a file
     errors
-        One sentence each: where, what is wrong, what was expected
+        One sentence each: where, what is wrong, what was expected. Sorted by line
     """
 
     def __init__(self, where: str, errors: list[str]):
         self.where = where
-        self.errors = list(errors)
+        self.errors = sorted(errors, key=_line)
         if len(self.errors) == 1:
             super().__init__(f"{where}: {self.errors[0]}")
         else:

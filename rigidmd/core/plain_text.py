@@ -54,6 +54,13 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return suggestion(similar_names(name, known))
 
 
+def did_you_mean_first(name: str, known: Iterable[str]) -> str:
+    """'; did you mean ...?' with the first of the similar names, and all known names."""
+    known = list(known)
+    near = similar_names(name, known)[:1]
+    return f"{suggestion(near)}{' There' if near else '; there'} are {', '.join(known)}"
+
+
 def suggestion(names: list[str]) -> str:
     """'; did you mean ...?' for these names. Empty for none."""
     return f"; did you mean {' or '.join(names)}?" if names else ""
@@ -69,8 +76,9 @@ def similar_names(name: str, known: Iterable[str]) -> list[str]:
     plain = {key: plain_letters(key) for key in known}
     asked = plain_letters(name)
     near = [key for key, letters in plain.items() if letters == asked]
-    near = near or [key for key, letters in plain.items() if asked and letters.startswith(asked)]
-    near = near or [key for key, letters in plain.items() if asked and letters.endswith(asked)]
+    if len(asked) > 1:
+        near = near or [key for key, letters in plain.items() if letters.startswith(asked)]
+        near = near or [key for key, letters in plain.items() if letters.endswith(asked)]
     if not near or len(near) > MOST_SUGGESTIONS:
         alike = difflib.get_close_matches(asked, plain.values(), 1, 0.6)
         near = [key for key, letters in plain.items() if letters in alike]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rigidmd.core.plain_text import did_you_mean_first
 from rigidmd.core.quantities import QUANTITIES, Quantity, current_name
 from rigidmd.core.statistics import least_error_from, may_be_unsteady, steady_from
 
@@ -48,7 +49,7 @@ class SampleTable(ABC):
         with all names."""
         column = current_name(column, self.described)
         if column not in self.described:
-            raise KeyError(f"no column {column!r}; there are {', '.join(self.described)}")
+            raise KeyError(f"no column {column!r}{did_you_mean_first(column, self.described)}")
         return self._array(column)
 
     @abstractmethod

@@ -103,8 +103,9 @@ def make_folder(folder: Path, names: Iterable[str], lock: "FolderLock") -> None:
 def check_is_run(folder: Path) -> None:
     """Raise OutputError unless a run has written to a folder."""
     if not folder.is_dir():
-        what = "is a file" if folder.exists() else "is not there"
-        raise OutputError(f"{folder} {what}. Name the folder of a run, such as runs/water")
+        path = str(folder)
+        what = f"{path} is a file" if folder.exists() else f"the folder {path!r} does not exist"
+        raise OutputError(f"{what}. Name the folder of a run, such as runs/water")
     if (folder / SWEEP).is_file():
         raise OutputError(f"{folder} is the folder of a sweep. Name one of the runs in it")
     if not (folder / MARKER).is_file() or not (folder / SCENE).is_file():

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
+from rigidmd.core.plain_text import did_you_mean_first
 from rigidmd.core.quantities import Quantity, current_name
 from rigidmd.core.statistics import format_with_error, mean_and_error
 from rigidmd.engines.samples import Samples, equilibrated
@@ -47,7 +48,7 @@ def mean_of_production(results: "Results", name: str, *, zero_step: bool) -> Est
     known = {alias: row for row in system.quantities.values() for alias in _names(row)}
     name = current_name(name, system.quantities)
     if name not in known:
-        raise KeyError(f"no mean of {name!r}; there are {', '.join(known)}")
+        raise KeyError(f"no mean of {name!r}{did_you_mean_first(name, known)}")
     quantity = known[name]
     moving = [k for k, stage in enumerate(system.scene.stages) if not stage.is_minimisation]
     k = max(set(samples["stage"].tolist()) & set(moving), default=None)

@@ -76,6 +76,8 @@ def hint_on_key(name: str, keys: list, value: object, model: type[BaseModel]) ->
     is_start = any(re.fullmatch(f"{re.escape(name)}_[a-zA-Z0-9_]+", key) for key in known)
     if converted := _other_unit(name, value, known):
         return converted
+    if known == ["acceleration_m_s2"] and isinstance(value, int | float):
+        return f"; write acceleration_m_s2 = [0, 0, {-abs(value):.12g}]"
     if longer := _with_its_words(name, known):
         return suggestion(longer)
     if not is_start and (foreign := _foreign(name, model) or _foreign(bare, model)):
@@ -144,6 +146,8 @@ def _listed(name: str, known: list[str]) -> str:
     """The known keys, or the most similar of them."""
     if not known:
         return ""
+    if len(known) == 1:
+        return f"; the only key is {known[0]}"
     if len(known) <= MOST_LISTED + 1:
         return f"; there are {', '.join(known)}"
     nearest = sorted(known, key=lambda key: -_similarity(name, key))[:MOST_LISTED]

@@ -197,9 +197,9 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     def _errors(self):
         if self.has_thermostat and self.temperature_K is None:
-            yield f"an {self.ensemble} stage needs temperature_K"
+            yield f"an {self.ensemble} stage needs temperature_K, for example temperature_K = 300"
         if self.has_barostat and self.pressure_bar is None:
-            yield f"an {self.ensemble} stage needs pressure_bar"
+            yield f"an {self.ensemble} stage needs pressure_bar, for example pressure_bar = 1"
         if idle := [key for key in self.idle_keys if self._is_given(key)]:
             where = self._where([self._users(key) for key in idle])
             yield f"{', '.join(idle)} would have no effect {where}"

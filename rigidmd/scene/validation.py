@@ -62,6 +62,14 @@ def _add_docstrings(schema: Json, kind: type[BaseModel]) -> None:
                 described.setdefault("description", inspect.cleandoc(ast.literal_eval(text.value)))
 
 
+class Contradictions(ValueError):
+    """Keys of a table contradict each other."""
+
+    def __init__(self, messages: list[str]):
+        super().__init__("; ".join(messages))
+        self.messages = messages
+
+
 if TYPE_CHECKING:
     from pydantic._internal._model_construction import ModelMetaclass
 else:
@@ -95,8 +103,8 @@ class Section(BaseModel, metaclass=SectionKind):
 
     @model_validator(mode="after")
     def _is_sound(self):
-        if errors := "; ".join(self._errors()):
-            raise ValueError(errors)
+        if errors := [*self._errors()]:
+            raise Contradictions(errors)
         return self
 
     def _errors(self) -> Iterable[str]:
@@ -170,6 +178,7 @@ def validation_messages(
     reported : paths of keys that have messages already
     """
     errors: dict[tuple, list[str]] = {}
+    of_tables: list[str] = []  # that keys of the whole input contradict each other
     for detail in error.errors(include_url=False):
         unknown = detail["type"] == "extra_forbidden"  # the last key is text of the user
         names = detail["loc"][:-1] if unknown else detail["loc"]
@@ -177,18 +186,44 @@ def validation_messages(
         keys += detail["loc"][-1:] if unknown else ()
         if detail["type"] == "missing" and keys and isinstance(keys[-1], int):
             keys = keys[:-1]  # the list lacks an entry
+        fault = detail.get("ctx", {}).get("error")
+        if not keys and isinstance(fault, Contradictions):
+            of_tables += [_with_line(message, text) for message in fault.messages]
+            continue
         # Messages beyond the number shown are only counted.
         sentence = _sentence(detail, keys, model) if len(errors) <= MOST_SHOWN else detail["msg"]
         errors.setdefault(tuple(keys), []).append(sentence)
     # pydantic reports one error for each type that a value may have: join them. An error inside a
     # value is more specific than an error of the whole value.
     known = set(map(tuple, reported))
+    for keys in [*errors]:
+        if errors[keys] == [SENTENCES["missing"]] and _is_meant(keys, errors):
+            del errors[keys]
     around = {keys[:depth] for keys in {*errors, *known} for depth in range(1, len(keys))}
-    return [
+    return of_tables + [
         f"{location_of(list(keys), text, overridden)}: {_either(list(dict.fromkeys(sentences)))}"
         for keys, sentences in errors.items()
         if keys not in around | known
     ]
+
+
+def _with_line(message: str, text: str) -> str:
+    """A message with the line of the key that it begins with."""
+    path = re.match(r"\w+(\.\w+)*", message)
+    keys = [int(key) if key.isdigit() else key for key in path[0].split(".")] if path else []
+    line = line_of(keys, text) if keys else None
+    return f"line {line}: {message}" if line else f"scene: {message}"
+
+
+def _is_meant(missing: tuple, errors: dict[tuple, list[str]]) -> bool:
+    """Whether the message on an unknown key of the same table names a missing one."""
+    key = str(missing[-1]) if missing else ""
+    name = re.compile(rf"\b{re.escape(key)}\b")
+    return any(
+        keys[:-1] == missing[:-1] and sentence.startswith(UNKNOWN) and name.search(sentence)
+        for keys, sentences in errors.items()
+        for sentence in sentences
+    )
 
 
 def numbers_out_of_range(data: object, least: float, largest: float) -> list[tuple[list, str]]:
@@ -251,6 +286,7 @@ def is_within(path: str, keys: Iterable[str]) -> bool:
 
 #: A part of a location of pydantic that names the branch of a union.
 UNION_BRANCH = re.compile(r"[\[(]|^(constrained-)?(float|int|bool|str)$")
+UNKNOWN = "unknown key"
 #: Messages by the type of pydantic's error.
 SENTENCES = {
     "missing": "is missing",
@@ -324,7 +360,7 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
     context = detail.get("ctx", {})
     match detail["type"]:
         case "extra_forbidden":
-            return "unknown key" + hint_on_key(str(keys[-1]), keys[:-1], value, model)
+            return UNKNOWN + hint_on_key(str(keys[-1]), keys[:-1], value, model)
         case "missing" if isinstance(detail["loc"][-1], int) and isinstance(value, list | tuple):
             return f"has {len(value)} entries, needs more"
         case "literal_error":

@@ -133,7 +133,9 @@ def test_a_body_has_matrices_and_si_units():
     assert results.units["Q"] == "1"
     assert results.units["omega_body_1"] == "rad/s"
     assert results["kinetic"] + results["potential"] == pytest.approx(results["energy"])
-    with pytest.raises(KeyError, match=r"no column 'energ'; there are time, x.*, Q"):
+    with pytest.raises(
+        KeyError, match=r"no column 'energ'; did you mean energy\? There are time, x.*, Q"
+    ):
         results["energ"]
     stone = Simulation(Scene.read(ROOT / "systems" / "dropped_stone.toml")).run()
     with pytest.raises(KeyError, match="no column 'Q'"):

@@ -1,6 +1,7 @@
 """Bad scenes: each has one message that states what, where and what to do; nothing is written and no traceback shown."""
 
 import re
+import tomllib
 
 import pytest
 from support.common import refused, small_scene
@@ -578,3 +579,57 @@ def test_files_and_keys_that_are_wrong_are_reported_at_once(tmp_path):
         "line 11: stages.0.duration_ps: is -1",
     ):
         assert words in said
+
+
+def test_errors_are_in_the_order_of_lines(tmp_path):
+    path = tmp_path / "s.toml"
+    path.write_text(
+        "seed = -1\n[box]\ndensity_g_cm3 = 0.9\n[structure]\nfile = 'x.gro'\n[forces]\n"
+        "cutof_A = 6.0\nskin_A = -1\n[[molecules]]\nmodel = 'spce'\ncount = 0\n[[stages]]\n"
+        "ensemble = 'nvx'\ntimestep = 3\n"
+    )
+    with pytest.raises(SceneError) as error:
+        Scene.read(path)
+    lines = [int(re.match(r"line (\d+): ", message)[1]) for message in error.value.errors]
+    assert lines == sorted(lines) and lines[0] == 1 and len(lines) >= 7
+
+
+def test_a_contradiction_of_tables_has_the_line_of_its_first_key(tmp_path):
+    path = tmp_path / "s.toml"
+    (tmp_path / "x.gro").write_text("")
+    path.write_text(
+        "[box]\ndensity_g_cm3 = 0.9\n[structure]\nfile = 'x.gro'\n[[molecules]]\nmodel = 'spce'\n"
+        "[[stages]]\nduration_ps = 1\n"
+    )
+    with pytest.raises(SceneError) as error:
+        Scene.read(path)
+    first, second = error.value.errors
+    assert first.startswith("line 2: box.density_g_cm3 and a structure file contradict")
+    assert second.startswith("scene: start.temperature_K is missing")
+
+
+@pytest.mark.parametrize("key", ["duration", "nsteps", "duration_ns"])
+def test_a_key_that_is_written_wrongly_gives_one_error(key, tmp_path, capsys):
+    text = GOOD.replace("duration_ps", key, 1)
+    assert text != GOOD
+    with pytest.raises(SceneError) as error:
+        Scene.from_dict(tomllib.loads(text))
+    (message,) = [line for line in error.value.errors if "duration" in line]
+    assert "unknown key" in message and "duration_ps" in message
+
+
+def test_an_ensemble_without_its_keys_has_an_example():
+    stages = [{"ensemble": "npt", "temperature_K": 300.0, "duration_ps": 1.0}]
+    with pytest.raises(SceneError, match="needs pressure_bar, for example pressure_bar = 1"):
+        small_scene({"argon": 20}, 30.0, stages=stages)
+
+
+def test_a_bracket_that_is_not_closed_has_line_and_position(tmp_path):
+    path = tmp_path / "s.toml"
+    path.write_text(GOOD + '\n[[forces.custom]]\nname = "x"\nenergy = "A*exp(-B*r"\n')
+    with pytest.raises(SceneError) as error:
+        Scene.read(path)
+    line = len(path.read_text().splitlines())
+    assert f"line {line}: forces.custom.0.energy: the bracket at position 6 is not closed" in str(
+        error.value
+    )

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from rigidmd.core.display import Displayed
+from rigidmd.core.plain_text import did_you_mean_first
 from rigidmd.core.statistics import (
     correlation_time,
     error_of_mean,
@@ -179,7 +180,7 @@ class AnalysisResult(Displayed):
         for curve in self.curves:
             known |= curve.table
         if column not in known:
-            raise KeyError(f"no column {column!r}; there are {', '.join(known)}")
+            raise KeyError(f"no column {column!r}{did_you_mean_first(column, known)}")
         return known[column]
 
     def value(self, name: str = "") -> Value:
@@ -203,9 +204,8 @@ class AnalysisResult(Displayed):
         for value in self.values:
             if name in ("", value.name):
                 return value
-        raise KeyError(
-            f"no value {name!r}; there are {', '.join(value.name for value in self.values)}"
-        )
+        known = [value.name for value in self.values]
+        raise KeyError(f"no value {name!r}{did_you_mean_first(name, known)}")
 
     def plot(self, curve: str = "") -> "Picture":
         """A Matplotlib figure of its curves, which a notebook displays and `savefig` writes, as
@@ -287,9 +287,8 @@ class AnalysisResult(Displayed):
         for curve in self.curves:
             if name in ("", curve.file):
                 return curve
-        raise KeyError(
-            f"no curve {name!r}; there are {', '.join(curve.file for curve in self.curves)}"
-        )
+        known = [curve.file for curve in self.curves]
+        raise KeyError(f"no curve {name!r}{did_you_mean_first(name, known)}")
 
     def __str__(self) -> str:
         curves = [f"{', '.join(curve.columns)} against {curve.axis[0]}" for curve in self.curves]

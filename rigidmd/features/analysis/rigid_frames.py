@@ -178,7 +178,9 @@ class RigidFrames:
             species = self.system.species
             known = [
                 *dict.fromkeys(
-                    [n for m in species for n in m.site_names] + [m.name for m in species]
+                    [n for m in species for n in m.site_names]
+                    + [m.name for m in species]
+                    + [e for m in species for e in m.elements if e]
                 )
             ]
             raise OutputError(

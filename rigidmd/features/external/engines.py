@@ -48,10 +48,10 @@ class Key(NamedTuple):
         how = self.values.get(value, Missing(self.reason))
         if not isinstance(how, Missing):
             return None
-        known = " and ".join(
-            str(name) for name, how in self.values.items() if name and not isinstance(how, Missing)
-        )
-        return f"{self.name} = {value!r}: {how or f'{title} has {known}'}"
+        known = [name for name, how in self.values.items() if not isinstance(how, Missing)]
+        names = sorted(map(str, filter(None, known)), key="none".__eq__)
+        listed = " or ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
+        return f"{self.name} = {value!r}: {how or f'{title} has {listed}'}"
 
 
 Subject = TypeVar("Subject", ForceFieldView, Stage)

@@ -3,13 +3,32 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import Field, create_model
+from pydantic import AfterValidator, Field, create_model
 
 from rigidmd.core.toml import Json, shorten_repr
 from rigidmd.scene.added_forces import AddedForce, AddedForces
 from rigidmd.scene.table_in_file import TableInFile
 from rigidmd.scene.truncation import TruncationName
 from rigidmd.scene.validation import MOST_TABLES, Cutoff, Line, Number, Positive, Section
+
+
+def closed_brackets(energy: str) -> str:
+    """A formula whose brackets are pairs. Raises ValueError."""
+    left = list[int]()
+    for position, character in enumerate(energy, 1):
+        if character == "(":
+            left.append(position)
+        elif character == ")" and not left:
+            raise ValueError(f"a bracket is closed at position {position} that is not open")
+        elif character == ")":
+            left.pop()
+    if left:
+        raise ValueError(f"the bracket at position {left[-1]} is not closed: {energy!r}")
+    return energy
+
+
+#: The formula of an energy.
+Energy = Annotated[str, Field(min_length=1, max_length=2000), AfterValidator(closed_brackets)]
 
 
 class PairParameters(Section):
@@ -29,7 +48,7 @@ class CustomForce(AddedForce):
     """Name in the log. With `module` it is also the name of the object in this file"""
     module: Line | None = None
     """Python file in the folder of the scene. Its code runs only with --trust FILE"""
-    energy: Annotated[str, Field(min_length=1, max_length=2000)] | None = None
+    energy: Energy | None = None
     """Without a module: energy of a pair of sites (kJ/mol) as a function of their distance r (Å)
     and named parameters, such as A*exp(-B*r) - C/r**6. The functions exp, log, sqrt, sin and cos
     can be used"""
@@ -104,7 +123,7 @@ class BodyForce(AddedForce):
     potential: Literal["gay_berne", "dipole", "quadrupole", "patch"] | None = None
     """gay_berne: ellipsoids. dipole and quadrupole: at a point. patch: spheres with an attractive
     patch"""
-    energy: Annotated[str, Field(min_length=1, max_length=2000)] | None = None
+    energy: Energy | None = None
     """Instead of a potential: the energy (kJ/mol) as a function of the distance r (Å), the cosines
     a_r and b_r, the cosine a_b and named parameters. a_r and b_r belong to the angles between the
     axes of the first and the second body and the vector from the first to the second body. a_b

@@ -241,7 +241,8 @@ def test_names_of_sites_are_suggested(water):
     history = frames_of_folder(read_record(water), 0.02)
     rdf = registry.selected(["rdf"])[0].function
     with pytest.raises(
-        OutputError, match=r"^unknown site 'ow'; did you mean OW\? there are OW, HW1, HW2, spce$"
+        OutputError,
+        match=r"^unknown site 'ow'; did you mean OW\? there are OW, HW1, HW2, spce, O, H$",
     ):
         rdf(history, "OW", "ow")
     with pytest.raises(OutputError, match=r"^unknown site 'Xe'; there are OW"):

@@ -394,7 +394,7 @@ def with_strange(system, what):
     [
         ("thermostat", "stages.0.thermostat = 'made_up': {}"),
         ("barostat", "stages.0.barostat = 'made_up': {}"),
-        ("truncation", "forces.truncation = 'made_up': {} has plain and shift and"),
+        ("truncation", "forces.truncation = 'made_up': {} has plain, shift, "),
         ("potential", "coulomb: the pair potential Stranger has no translation for {}"),
         ("field", "field: a field has no translation for {}"),
         ("term", "term: the term Stranger has no translation for {}"),

@@ -274,7 +274,7 @@ def test_notes_that_a_page_has_elsewhere_are_not_warnings(water, tmp_path):
 @pytest.mark.parametrize(
     ("fault", "said"),
     [
-        ("nothing", "is not there. Name the folder of a run"),
+        ("nothing", "does not exist. Name the folder of a run"),
         ("a file", "is a file. Name the folder of a run"),
         ("no run", "is not the folder of a run"),
         ("no samples", "the run has not written samples yet. `rigidmd resume"),

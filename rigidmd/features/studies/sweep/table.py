@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rigidmd.core.display import Displayed
+from rigidmd.core.plain_text import did_you_mean_first
 from rigidmd.core.quantities import QUANTITIES, with_means
 from rigidmd.core.statistics import format_with_error, mean_and_error, standard_error
 from rigidmd.core.toml import Json
@@ -138,8 +139,8 @@ class Table(Displayed):
 
     def _measured(self, column: str) -> np.ndarray:
         if column not in self.columns:
-            names = ", ".join([*self.keys, *self.columns])
-            raise KeyError(f"no column {column!r}; there are {names}")
+            known = [*self.keys, *self.columns]
+            raise KeyError(f"no column {column!r}{did_you_mean_first(column, known)}")
         return np.array([row[column] for row in self.rows], float).reshape(-1, 2)
 
     def has_error(self, column: str) -> bool:
