@@ -636,26 +636,26 @@ GROUPS = {
 
 
 def models_tables() -> str:
-    """The tables of reference/models.md, from the files of the models."""
-    rows: dict[str, list[str]] = {group: [] for group in GROUPS}
+    """The tables of reference/models.md, from the files of the models. The ions of a water model
+    have one row."""
+    rows: dict[str, dict[str, list[str]]] = {group: {} for group in GROUPS}
     for path in sorted((ROOT / "rigidmd" / "models").glob("*.toml")):
         model = tomllib.loads(path.read_text(encoding="utf-8"))
-        mixing = "geometric mixing" if model.get("mixing") == "geometric" else ""
-        remarks = "; ".join(filter(None, [model.get("note"), mixing]))
-        cells = [
-            f"`{model['name']}`",
-            model["title"],
-            str(len(model["sites"])),
-            remarks,
-            model["source"],
-        ]
-        row = f"| {' | '.join(cells)} |".replace("|  |", "| |")
-        rows[model["group"]].append(re.sub(r"doi:([^\s)|]+)", r"[doi:\1](https://doi.org/\1)", row))
+        title, remarks = model["title"], [model.get("note")]
+        if model["group"] == "ion":
+            title, remarks = f"Ions, {title.partition(', ')[2]}", ["sigma from Rmin/2"]
+        if model.get("mixing") == "geometric":
+            remarks.append("geometric mixing")
+        cells = [title, str(len(model["sites"])), "; ".join(filter(None, remarks)), model["source"]]
+        row = f"{' | '.join(cells)} |".replace("|  |", "| |")
+        row = re.sub(r"doi:([^\s)|]+)", r"[doi:\1](https://doi.org/\1)", row)
+        rows[model["group"]].setdefault(row, []).append(f"`{model['name']}`")
     head = "| model | molecule | sites | remarks | source |\n|---|---|---|---|---|\n"
-    return (
-        "\n\n".join(f"## {GROUPS[group]}\n\n{head}" + "\n".join(rows[group]) for group in GROUPS)
-        + "\n"
-    )
+    tables = {
+        group: "\n".join(f"| {', '.join(names)} | {row}" for row, names in found.items())
+        for group, found in rows.items()
+    }
+    return "\n\n".join(f"## {GROUPS[group]}\n\n{head}{tables[group]}" for group in GROUPS) + "\n"
 
 
 def test_the_table_of_integrators_has_their_orders_and_costs():
