@@ -34,29 +34,54 @@ TALLY_SIZE = 10
 
 
 class State(NamedTuple):
-    """Everything that evolves. float64 except `step`; n bodies. Molecules in Å, ps, u, single
-    bodies in SI.
+    """Everything that evolves, for n bodies. Molecules in Å, ps and u, single bodies in SI units.
 
     A scene of points has rotation (0, 3, 3) and angular_momentum_body (0, 3), because points do not
     rotate. A pinned body has position and velocity (0, 3). Within a segment of equal steps the time
     is computed from the step, time[ORIGIN] + (step[NOW] - step[ORIGIN]) dt, so a run in parts has
     exactly the times of an uninterrupted one.
+
+    Attributes
+    ----------
+    position : ndarray
+        Centres of mass (n, 3), lab frame, never wrapped
+    velocity : ndarray
+        Their velocities (n, 3), lab frame
+    rotation : ndarray
+        Rotation matrices Q (n, 3, 3), body to lab
+    angular_momentum_body : ndarray
+        Angular momenta (n, 3), body frame
+    cell : ndarray
+        Rows (3, 3): a along x, b in the xy plane, c. Infinite edges without a box
+    time : ndarray
+        Time now, and when the segment of equal steps started (2,). `Simulation.time` is the first
+    step : ndarray
+        Steps since the start, and those when the segment started (2,), int64
+    energy_ledger : ndarray
+        Energies added so far (3,): heat, work, removed momentum. The energy less their sum is
+        conserved
+    extra_variables : ndarray
+        Variables (m,) of a thermostat, a piston or an ODE formulation. (0,) in most runs
     """
 
-    position: np.ndarray  # (n, 3) centre of mass, lab frame, never wrapped
-    velocity: np.ndarray  # (n, 3) lab frame
-    rotation: np.ndarray  # (n, 3, 3) Q, body to lab
-    angular_momentum_body: np.ndarray  # (n, 3)
-    cell: np.ndarray  # (3, 3) rows a along x, b in the xy plane, c; infinite edges without a box
-    time: np.ndarray  # (2,) now; when this segment of equal steps started
-    step: np.ndarray  # (2,) int64, steps since the start; those when this segment started
-    #: (3,) energies added so far, see HEAT; the energy less their sum is conserved
+    position: np.ndarray
+    velocity: np.ndarray
+    rotation: np.ndarray
+    angular_momentum_body: np.ndarray
+    cell: np.ndarray
+    time: np.ndarray
+    step: np.ndarray
     energy_ledger: np.ndarray
-    #: (m,) of a thermostat, a piston or an ODE formulation; (0,) in most runs
     extra_variables: np.ndarray
 
     def copy(self) -> "State":
-        """A state with copies of all arrays."""
+        """A state with copies of all arrays.
+
+        Returns
+        -------
+        State
+            The copy
+        """
         return State(*(array.copy() for array in self))
 
     @property
@@ -90,12 +115,30 @@ class State(NamedTuple):
         )
 
     def time_of(self, step: int, dt: float) -> float:
-        """The time at a step of the current segment, whose steps have the length dt."""
+        """The time at a step of the current segment.
+
+        Parameters
+        ----------
+        step : int
+            Steps since the start
+        dt : float
+            Length of a step, ps, for a body s
+
+        Returns
+        -------
+        float
+            The time, ps, for a body s
+        """
         return self.time[ORIGIN] + (step - self.step[ORIGIN]) * dt
 
     def begin_segment(self, time: float | None = None) -> None:
-        """Begin a segment of equal steps, in place. `time` is the current time if it is known
-        exactly."""
+        """Start a segment of equal steps, in place.
+
+        Parameters
+        ----------
+        time : float, optional
+            The current time if it is known exactly, ps, for a body s
+        """
         self.time[:] = self.time[NOW] if time is None else time
         self.step[ORIGIN] = self.step[NOW]
 

@@ -29,19 +29,60 @@ class Observation:
 
     The columns of the line are attributes too, such as `temperature`. Energies are in the unit that
     `observe` was given, kJ/mol in a run. Quantities that do not exist are NaN.
+
+    Attributes
+    ----------
+    system : System
+        The system of molecules
+    state : State
+        The state of the run, whose next steps change it
+    load : Load
+        Forces and torques, u Å/ps² and u Å²/ps²
+    energies : dict of str to float
+        Potential energy by term and constant, u Å²/ps²
+    energy_unit : float
+        Unit of energies, u Å²/ps²
+    time : float
+        Time since the start, ps
+    stage : int
+        Index of the stage
+    origin : float or None
+        Conserved energy at the start of the stage
+    extension_sums : ndarray or None
+        Sums of an engine since the last sample
+    sums : StateSums
+        Sums over molecules
+    ledger : ndarray
+        Heat, work and energy of removed momentum (3,), kJ/mol
+    potential, kinetic, energy : float
+        Potential and kinetic energy, and their sum, kJ/mol
+    kinetic_translation, kinetic_rotation : float
+        Parts of the kinetic energy, kJ/mol
+    temperature, temperature_translation, temperature_rotation : float
+        Temperatures of all motion, of translation and of rotation, K
+    virial : ndarray
+        Molecular virial (3, 3), without the tail correction, kJ/mol
+    pressure : float
+        Molecular pressure, bar
+    pressure_tensor : ndarray
+        Molecular pressure tensor (3, 3), symmetric, with the tail correction, bar
+    edges : list of float
+        Edges (Å) and angles (degrees) of the box
+    sample : Sample
+        The line of the log
     """
 
     system: System
-    state: State  # of the run, whose next steps change it
-    load: Load  # u Å/ps² and u Å²/ps²
-    energies: dict[str, float]  # potential energy by term and constant, u Å²/ps²
-    energy_unit: float  # u Å²/ps²
+    state: State
+    load: Load
+    energies: dict[str, float]
+    energy_unit: float
     time: float
     stage: int
-    origin: float | None  # see `observe`
+    origin: float | None
     extension_sums: np.ndarray | None
     sums: StateSums
-    ledger: np.ndarray  # (3,) see `State.energy_ledger`
+    ledger: np.ndarray
     potential: float
     kinetic_translation: float
     kinetic_rotation: float
@@ -50,11 +91,10 @@ class Observation:
     temperature: float
     temperature_translation: float
     temperature_rotation: float
-    virial: np.ndarray  # (3, 3) molecular, without the tail correction; an energy
-    pressure: float  # bar
-    #: (3, 3) molecular, tail correction included, symmetric, bar; NaN without a box
+    virial: np.ndarray
+    pressure: float
     pressure_tensor: np.ndarray
-    edges: list[float]  # of the box, and its angles
+    edges: list[float]
     sample: Sample = field(default_factory=Sample, init=False)
 
     def __getattr__(self, column: str) -> float:
@@ -72,10 +112,12 @@ class Observation:
 
     @property
     def stage_name(self) -> str:
+        """Name of the stage."""
         return self.system.scene.stages[self.stage].label
 
     @property
     def conserved(self) -> float:
+        """Total energy less heat, work and the energy of removed momentum, kJ/mol."""
         return self.energy - float(self.ledger.sum())
 
     @property

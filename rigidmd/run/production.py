@@ -25,7 +25,17 @@ NOT_KNOWN = (
 
 
 class Estimate(NamedTuple):
-    """A mean with its standard error, which is NaN if the run is too short for an error."""
+    """A mean with its error.
+
+    Attributes
+    ----------
+    value : float
+        The mean
+    error : float
+        Standard error. NaN if the run is too short for one
+    unit : str
+        Unit of both
+    """
 
     value: float
     error: float

@@ -11,13 +11,28 @@ import pytest
 import rigidmd
 import rigidmd.ase
 from rigidmd import analysis, view
+from rigidmd.core.state import State
+from rigidmd.engines.observables import Observation
 from rigidmd.features.analysis.result import AnalysisResult, Curve, Value
+from rigidmd.features.bodies.system import Pose
 from rigidmd.features.free_energy.virial import SecondVirial
 from rigidmd.features.studies.normal_modes import NormalModes
 from rigidmd.features.studies.sweep.table import Table
+from rigidmd.run.production import Estimate
 
 #: What public functions return.
-RETURNED = (AnalysisResult, Curve, NormalModes, SecondVirial, Table, Value)
+RETURNED = (
+    AnalysisResult,
+    Curve,
+    Estimate,
+    NormalModes,
+    Observation,
+    Pose,
+    SecondVirial,
+    State,
+    Table,
+    Value,
+)
 PROPERTIES = (property, cached_property)
 SECTION = re.compile(r"^(Parameters|Attributes|Returns|Raises|Examples)\n-+\n", re.MULTILINE)
 

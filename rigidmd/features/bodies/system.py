@@ -33,13 +33,27 @@ Component = TypeVar("Component", bound=NamedTuple)
 
 class Pose(NamedTuple):
     """Position, attitude and velocities of a body relative to the frame. Functions in `applied` are
-    called with it."""
+    called with it.
 
-    time: float  # s
-    position: np.ndarray  # (3,) centre of mass, m
-    velocity: np.ndarray  # (3,) m/s
-    rotation: np.ndarray  # (3, 3) Q, body to lab
-    angular_velocity_body: np.ndarray  # (3,) rad/s
+    Attributes
+    ----------
+    time : float
+        Time since the start, s
+    position : ndarray
+        Centre of mass (3,), m
+    velocity : ndarray
+        Its velocity (3,), m/s
+    rotation : ndarray
+        Rotation matrix Q (3, 3), body to lab
+    angular_velocity_body : ndarray
+        Angular velocity (3,), body frame, rad/s
+    """
+
+    time: float
+    position: np.ndarray
+    velocity: np.ndarray
+    rotation: np.ndarray
+    angular_velocity_body: np.ndarray
 
 
 @dataclass
