@@ -218,8 +218,8 @@ class AnalysisResult(Displayed):
 
         Returns
         -------
-        matplotlib.figure.Figure
-            The figure
+        Picture
+            A Matplotlib figure
 
         Raises
         ------

@@ -72,8 +72,8 @@ def plot(results: Results, *columns: str, log: bool = False) -> Picture:
 
     Returns
     -------
-    matplotlib.figure.Figure
-        The figure
+    Picture
+        A Matplotlib figure
 
     Raises
     ------

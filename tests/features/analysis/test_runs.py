@@ -541,7 +541,8 @@ def test_an_analysis_that_is_registered_is_a_function_of_results():
     results = Simulation(Scene.read(ROOT / "systems" / "water.toml", SHORT)).run()
     found = rigidmd.analysis.height_of_all(results, start=0.0)
     assert len(found["height_of_all"]) == len(results.rotation)
-    assert rigidmd.analysis.height_of_all.__doc__ == "mean height (Å)"
+    title, entries = rigidmd.analysis.height_of_all.__doc__.split("\n\nParameters\n")
+    assert title == "mean height (Å)" and "start : float" in entries
     assert "height_of_all" in dir(rigidmd.analysis)
     with pytest.raises(AttributeError, match="no attribute 'height_of_none'"):
         _ = rigidmd.analysis.height_of_none
