@@ -469,9 +469,7 @@ def test_a_platform_with_one_precision_has_no_other():
 
 
 def test_the_error_of_mixed_precision_is_the_one_in_the_manual():
-    assert (
-        f"(forces to {MIXED_ERROR:.0e})" in (ROOT / "rigidmd/docs/reference/scene.md").read_text()
-    )
+    assert f"forces to {MIXED_ERROR:.0e})" in (ROOT / "rigidmd/docs/reference/scene.md").read_text()
     system, ours, state = shaken(
         build(small_scene({"tip4p2005": 216}, 18.64, forces={"cutoff_A": 9.0})), 1, 0.2
     )
