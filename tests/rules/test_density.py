@@ -1,4 +1,5 @@
-"""One idea to a line: tokens per line of code, the formatter is on everywhere, and `Any` is rare."""
+"""One idea to a line: tokens per line of code, the formatter is on everywhere, and `Any` is rare.
+Pages are short, with few nominal phrases."""
 
 import io
 import re
@@ -10,6 +11,9 @@ from support.common import ROOT
 MOST_TOKENS = 9.0  # per line of code, in the mean over a package
 MOST_SKIPS = 15  # for tables of numbers
 MOST_ANY = 18  # may only fall
+MOST_WORDS = 66_000  # of all pages
+#: Per 1,000 words of text.
+MOST_OF, MOST_ITS = 28, 5
 LAYOUT = {
     tokenize.COMMENT,
     tokenize.NL,
@@ -66,3 +70,16 @@ def test_any_is_rare():
     paths = [*(ROOT / "rigidmd").rglob("*.py"), *(ROOT / "rigidmd").rglob("*.pyi")]
     count = sum(len(re.findall(r"\bAny\b", path.read_text(encoding="utf-8"))) for path in paths)
     assert count <= MOST_ANY, "replace Any by a type, or by a Protocol of what is used"
+
+
+def test_pages_are_short_with_few_nominal_phrases():
+    texts = [path.read_text("utf-8") for path in (ROOT / "rigidmd" / "docs").rglob("*.md")]
+    assert sum(len(text.split()) for text in texts) <= MOST_WORDS
+    blocks = re.compile(r"^```.*?^```$|<!--.*?-->|\$\$.*?\$\$|\$[^$]*\$", re.MULTILINE | re.DOTALL)
+    words = [
+        word.lower()
+        for text in texts
+        for word in re.findall(r"[A-Za-z][\w'-]*", blocks.sub("", text))
+    ]
+    assert 1000 * words.count("of") <= MOST_OF * len(words)
+    assert 1000 * words.count("its") <= MOST_ITS * len(words)

@@ -304,6 +304,9 @@ def test_recorded_output_is_of_the_scene_with_the_defaults_of_today(
     for k, block in enumerate(blocks):
         quoted = output_of(block)
         if quoted is None or not quoted.where:
+            assert quoted is None or quoted.kind == "of", (
+                f"line {block.line}: where it was recorded must follow a bar"
+            )
             continue
         write_files(blocks[:k], tmp_path)
         for words in new_scenes(blocks[:k]):
