@@ -102,7 +102,7 @@ def stage_notes(stages: tuple[Stage, ...]) -> list[str]:
         f"stages.{k}: compressibility_per_bar = {stage.compressibility:g} is outside the range of"
         f" substances (diamond {STIFFEST:g}, water {COMPRESSIBILITY:g}, a gas at 1 bar 1): is it in"
         " another unit? The box will"
-        f" {'hardly move' if stage.compressibility < STIFFEST else 'try moves that are too long'}"
+        f" {'barely move' if stage.compressibility < STIFFEST else 'try moves that are too long'}"
         for k, stage in enumerate(stages)
         if stage.has_barostat and not STIFFEST / 10 <= stage.compressibility <= SOFTEST
     ]

@@ -288,7 +288,7 @@ def _note_on_heating(
         f" {abs(heating):.2g} K too {'hot' if heating > 0 else 'cold'}: they move and rotate as at"
         f" {mean} K, while the thermostat controls the momenta at the ends of steps,"
         f" {level:.4g} K. Try timestep_fs = {shorter:.1g}, or integrator = 'baoab', the default,"
-        " whose positions have hardly such an error"
+        " whose positions have barely such an error"
     ]
 
 
@@ -305,7 +305,7 @@ def _notes_on_trajectories(stage: Stage, k: int, acceptance: np.ndarray) -> list
     if accepted > (LEAST_ACCEPTANCE if enough else 0.0):
         return []
     return [
-        f"stages.{k}: {where}{accepted:.1%} of the trajectories were accepted: positions hardly"
+        f"stages.{k}: {where}{accepted:.1%} of the trajectories were accepted: positions barely"
         " change and the errors of the means are too small. Try a shorter timestep_fs than"
         f" {stage.step_fs:g}, an integrator of higher order such as 'srkn_4', or integrator ="
         " 'auto'"

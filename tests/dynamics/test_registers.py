@@ -121,7 +121,7 @@ def flown(system, state, time):
 
 
 def with_weak_thermostat(molecules, integrator):
-    """A system, its engine, its state, and an integrator whose thermostat hardly acts."""
+    """A system, its engine, its state, and an integrator whose thermostat barely acts."""
     stage = {"ensemble": "nvt", "temperature_K": 300.0, "thermostat_time_ps": 1e15}
     stage |= {"duration_ps": 1.0, "integrator": integrator}
     run = {"remove_momentum_interval_ps": False}

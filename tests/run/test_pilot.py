@@ -509,7 +509,7 @@ def test_a_chosen_step_of_a_body_fits_its_duration_and_samples(
 
 
 def test_the_step_of_a_dilute_gas_resolves_collisions():
-    """Argon atoms beyond their cutoff at the start hardly interact: the mean frequency is that of
+    """Argon atoms beyond their cutoff at the start barely interact: the mean frequency is that of
     no collision."""
     stage = {
         "ensemble": "nvt",

@@ -89,7 +89,7 @@ def free_energy_of(
     if least < ENOUGH:
         k = int(np.diag(overlap, 1).argmin())
         notes.append(
-            f"lambda = {lambdas[k]:g} and {lambdas[k + 1]:g} hardly overlap ({least:.2g},"
+            f"lambda = {lambdas[k]:g} and {lambdas[k + 1]:g} barely overlap ({least:.2g},"
             f" {ENOUGH:g} is enough): add a point between them"
         )
     return AnalysisResult(NAME, ABOUT, values, [curve, matrix], notes)

@@ -191,7 +191,7 @@ def _overlap_notes(windows: Sequence[Window], overlap: np.ndarray) -> list[str]:
         )
     if least < LITTLE_OVERLAP:
         return [
-            f"{where} hardly overlap ({least:.2g}, {LITTLE_OVERLAP:g} is enough): add a window"
+            f"{where} barely overlap ({least:.2g}, {LITTLE_OVERLAP:g} is enough): add a window"
             " between them"
         ]
     return []

@@ -358,7 +358,7 @@ def test_few_samples_and_missing_overlap_are_reported():
     near[:, 1] += 15.0
     far[:, 0] += 15.0
     result = free_energy_of([0.0, 1.0], [SampledLambda(0, near), SampledLambda(1, far)], 2.5)
-    assert any("hardly overlap" in note and "add a point" in note for note in result.notes)
+    assert any("barely overlap" in note and "add a point" in note for note in result.notes)
     with pytest.raises(OutputError, match=r"5 decorrelated samples at lambda = 1.*run longer"):
         free_energy_of([0.0, 1.0], [SampledLambda(0, near), SampledLambda(1, far[:5])], 2.5)
 

@@ -95,7 +95,7 @@ def test_overlap_of_windows_with_different_numbers_of_samples():
     first, second = density * np.array(counts)[:, None]
     exact = (first * density[1] / (first + second)).sum()
     assert exact < 0.03
-    (note,) = [n for n in potential_of_mean_force(some, KT).notes if "hardly overlap" in n]
+    (note,) = [n for n in potential_of_mean_force(some, KT).notes if "barely overlap" in n]
     shown = float(note.partition("(")[2].partition(",")[0])
     assert shown == pytest.approx(exact, rel=0.3)
 
@@ -145,7 +145,7 @@ def test_windows_that_are_not_a_chain():
     little = potential_of_mean_force(
         windows(4, lennard_jones, distances=[4.0, 4.3, 5.3], stiffness=30.0), KT
     )
-    assert any("4.3 and 5.3 Å hardly overlap" in note for note in little.notes)
+    assert any("4.3 and 5.3 Å barely overlap" in note for note in little.notes)
     short = [Window(4.0, STIFFNESS, np.array([4.0, 4.1, 3.9]))]
     with pytest.raises(OutputError, match="decorrelated samples of 3, and needs 10: run longer"):
         potential_of_mean_force(short, KT)
