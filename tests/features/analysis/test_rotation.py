@@ -50,7 +50,7 @@ def test_free_rotational_diffusion_decays_as_it_must():
         assert told.error < 0.1 * D
 
 
-def test_what_hardly_rotates_or_rotates_too_fast_gives_no_time():
+def test_what_barely_rotates_or_rotates_too_fast_gives_no_time():
     system = system_of({"ccl4": 8}, 40.0, 9.0)
     rng, time = np.random.default_rng(0), np.arange(100.0)
     still = np.broadcast_to(random_rotations(rng, 8), (100, 8, 3, 3))
