@@ -1,7 +1,8 @@
-"""Rewrites the quoted outputs of README and of the pages.
+"""Rewrites the quoted outputs of README and of the pages, and their figures.
 
     PYTHONPATH=tests python tests/support/outputs.py                     # what takes at most a minute
     PYTHONPATH=tests python tests/support/outputs.py npt --limit 600     # one page, up to ten minutes each
+    PYTHONPATH=tests python tests/support/outputs.py --figures           # the figures too
 
 Each command runs as the page has it, in a folder with a copy of systems/ and the files of the page.
 A line of a block is replaced by the line of the new output that has the same words. The script lists
@@ -31,6 +32,7 @@ from support.documents import (
     pattern_of,
     write_files,
 )
+from support.page_figures import redraw
 
 SECONDS = re.compile(r", (\d+) s$")
 
@@ -135,6 +137,7 @@ def main() -> None:
     )
     parser.add_argument("pages", nargs="*", help="names of pages; all by default")
     parser.add_argument("--limit", type=float, default=60, metavar="SECONDS")
+    parser.add_argument("--figures", action="store_true", help="draw the figures of all pages")
     options = parser.parse_args()
     for path in DOCUMENTS:
         if options.pages and path.stem not in options.pages:
@@ -146,7 +149,10 @@ def main() -> None:
                 took = SECONDS.search(quoted.where) if quoted else None
                 if quoted is None or (took and float(took[1]) > options.limit):
                     continue
-                print(*page.rewrite(block, quoted), sep="\n", flush=True)
+                for line in page.rewrite(block, quoted):
+                    print(line, flush=True)
+    for name in redraw(options.limit) if options.figures else ():
+        print(f"{name}: drawn", flush=True)
 
 
 if __name__ == "__main__":
