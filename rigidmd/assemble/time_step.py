@@ -42,8 +42,8 @@ BIAS_AT_ENDS, BIAS_IN_MIDDLE = (0.6, 0.002), (0.1, 0.005)
 #: Largest error of a default step without a thermostat, or of tested trajectories: 2 fs for water.
 DEFAULT_ERROR = 0.0125
 #: Default steps are at most this long, fs. At 20 fs the bias of U in liquids without hydrogen is at
-#: most 0.0017 kT per degree of freedom, but the conserved energy of CO2, benzene and acetonitrile
-#: drifts by 0.3 to 1.5 kT/ns per degree of freedom.
+#: most 0.0014 kT per degree of freedom, but the conserved energy of CO2, benzene and acetonitrile
+#: drifts by 0.4 to 1.2 kT/ns per degree of freedom.
 LONGEST_DEFAULT = 10.0
 #: A step that is this many times shorter than the longest stable one is probably in another unit.
 NEEDLESS = 1000

@@ -156,7 +156,7 @@ class Scheme(_SchemeFields):
         pressures, with K at the ends of steps.
 
         With a thermostat it is the mean kinetic energy where the thermostat acts, without one that
-        without an error of order dt². See "Temperatures" in the theory chapter `errors`.
+        without an error of order dt². See "Temperatures" in the theory chapter `zero_step`.
         """
         kinds = [flow.kind for flow in self.flows]
         if END in kinds:

@@ -318,7 +318,7 @@ def drift_of_thermostats(system: System, of_stage: Samples, k: int) -> tuple[flo
 
     In the middle of a drift the shadow Hamiltonian has 1 - x/12 of the kinetic energy, where x is
     the mean (w dt)² of these motions, so that equal heats at both thermostats are not equal in it.
-    See "Temperatures" in the theory chapter `errors`.
+    See "Temperatures" in the theory chapter `zero_step`.
     """
     stage = system.scene.stages[k]
     freedom = system.freedom_in(k)

@@ -1,8 +1,8 @@
 """Averages at zero time step: mean = limit + slope dt^p, where p is the order of the integrator.
 
 The limit belongs to the ensemble, not to the integrator, so that one weighted fit has the same
-limit for all methods and a slope for each of them. See "Averages at zero time step" in the theory
-chapter `errors`.
+limit for all methods and a slope for each of them. See "Several steps" in the theory chapter
+`zero_step`.
 """
 
 from collections.abc import Mapping, Sequence

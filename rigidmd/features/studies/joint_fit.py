@@ -1,7 +1,7 @@
 """Energy and volume at zero time step together: means at several steps, and the slopes that
 fluctuations predict.
 
-See "Energy and volume together" in the theory chapter `errors`.
+See "Energy and volume together" in the theory chapter `zero_step`.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,6 +1,6 @@
 """What the time step does to the means of a run, to first order in dt², from its own fluctuations.
 
-See "The step in one run" in the theory chapter `errors`.
+See "One run" in the theory chapter `zero_step`.
 """
 
 from collections.abc import Iterator, Mapping

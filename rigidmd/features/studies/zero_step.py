@@ -35,7 +35,7 @@ def zero_step(
     from covariances in the run itself.
 
     The error of a value includes errors of the mean, of the covariances, and of the next order in
-    dt². The theory chapter `errors` has the formulas and what they assume.
+    dt². The theory chapter `zero_step` has the formulas and what they assume.
 
     Parameters
     ----------

@@ -7,8 +7,8 @@ force -v',
     v(r) + constant - integral of p(x) dx   (r > start),
     x = r - start,   p(x) = linear + quadratic x² + cubic x³
 
-See the theory chapter `interactions` for the formulas, for what is continuous, and for the order
-that integrators keep.
+See the theory chapter `interactions` for the formulas and for what is continuous, and `dynamics`
+for the order that integrators keep.
 """
 
 from collections.abc import Callable
