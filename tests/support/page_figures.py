@@ -41,14 +41,14 @@ _WATER = Drawing("figures.py water", 60, "runs")
 _COLLECTION = Drawing("collection.py --pages", 5, "data")
 #: Image -> what draws it.
 FIGURES = {
-    "calculator_steps.png": Drawing("calculators.py", 900, "runs"),  # needs tblite
+    "calculator_steps.png": Drawing("calculators.py", 600, "runs"),  # needs tblite
     "collection_top.png": _COLLECTION,
     "collection_water.png": _COLLECTION,
     "error_time.png": _COLLECTION,
     "euler_angles.png": Drawing("euler_angles.py", 2, "data"),
     "long_run.png": Drawing("long_run.py", 3, "data"),
     "model_tip5p.png": Drawing("figures.py model", 3, "data"),
-    "normal_modes_spce.png": Drawing("figures.py modes", 120, "runs"),
+    "normal_modes_spce.png": Drawing("figures.py modes", 60, "runs"),
     "scaling.png": Drawing("scaling.py --draw", 3, "data"),
     "seven_tops.png": Drawing("seven_tops.py", 20, "runs"),
     "single_body.png": Drawing("single_body.py --draw", 3, "data"),
@@ -56,7 +56,7 @@ FIGURES = {
     "water.gif": _WATER,
     "water_box.png": _WATER,
     "water_energy.png": _WATER,
-    "water_slab.png": Drawing("figures.py slab", 600, "runs"),
+    "water_slab.png": Drawing("figures.py slab", 400, "runs"),
     "zero_step.png": Drawing("zero_step.py", 40_000, "runs"),
 }
 

@@ -185,10 +185,9 @@ def animation_parts(record: Record, animation: Animation, results: str = "") -> 
     data = data.replace("<", "\\u003c")
     legend = f'<p class="legend">{part.legend}</p>' if part.legend else ""
     return [
-        f'<div class="film"><div><div class="stage">{part.picture}{BAR}</div>'
-        f'{legend}<p class="faint noprint">{part.usage}</p>'
-        f'<div class="faint">{items(animation.notes)}</div></div>'
-        f"<div>{results}{plots.plots_part(record)}</div></div>",
+        f'<div class="film"><div class="stage">{part.picture}{BAR}</div>'
+        f'<div>{results}{legend}<p class="faint noprint">{part.usage}</p>'
+        f'<div class="faint">{items(animation.notes)}</div></div></div>{plots.plots_part(record)}',
         f'<script type="application/json" id="film-data">{data}</script>',
         *(f"<script>{text}</script>" for text in part.scripts),
     ]

@@ -28,13 +28,17 @@ def stage_tables(record: Record) -> Iterator[str]:
     yield "".join(f"<p>{html.escape(stage_title(stage))}</p>" for stage in stages)
     if shown:
         header, *rows = means_table(shown, system.quantities)
-        yield table(header, map(_unbroken, rows), words=True)
+        yield table(header[:-1], [_row(*row) for row in rows], words=True)
         yield items(note for stage in shown for note in stage_notes(stage))
 
 
-def _unbroken(row: list[str]) -> list[str]:
-    """A row of the table whose numbers stay with their errors, and whose unit wraps between
-    words."""
-    title, *cells, unit = row
-    cells = [cell.replace(" ± ", "\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}") for cell in cells]
-    return [title, *cells, Raw(f'<span class="unit">{html.escape(unit)}</span>')]
+def _row(title: str, *cells: str) -> list[str]:
+    """A row of the table of the report: the unit is next to the title, and numbers stay with their
+    errors."""
+    *means, unit = cells
+    of_unit = f'<span class="unit"> {html.escape(unit)}</span>' if unit else ""
+    numbers = [mean.replace(" ± ", "\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}") for mean in means]
+    return [
+        Raw(html.escape(title) + of_unit),
+        *(Raw(f'<span class="whole">{html.escape(number)}</span>') for number in numbers),
+    ]
