@@ -7,6 +7,8 @@ from rigidmd.features.analysis.result import AnalysisResult, Value
 from rigidmd.io.write import columns_text
 from rigidmd.scene.validation import not_none
 
+DETAILS = "mean total dipole"  # begin of the names of values that are printed on request
+MOST_UNCERTAIN = 0.5  # the largest error of a value that is known, relative to it
 HEADERS = ("quantity", "value", "unit", "correlation time (ps)")
 
 
@@ -16,15 +18,22 @@ def frames_text(count: int, begin: float, end: float) -> str:
     return f"{what} from {begin:g} to {end:g} ps"
 
 
-def results_text(results: Sequence[AnalysisResult], failed: Mapping[str, str]) -> list[str]:
+def results_text(
+    results: Sequence[AnalysisResult], failed: Mapping[str, str], *, verbose: bool = False
+) -> list[str]:
     """Lines with a table of all values, the values that a run is too short for, and the analyses
     that were not possible.
 
-    failed : analysis -> a sentence on why
+    failed : analysis -> a sentence on why; verbose : with components that are zero on average
     """
-    values = [value for result in results for value in result.values]
-    known = [value for value in values if value.value is not None]
-    missing = {value.name: value.note for value in values if value.value is None}
+    values = [
+        value
+        for result in results
+        for value in result.values
+        if verbose or not value.name.startswith(DETAILS)
+    ]
+    known = [value for value in values if is_known(value)]
+    missing = {value.name: value.note or uncertain(value) for value in values if value not in known}
     lines = []
     if known:
         table = columns_text([HEADERS, *map(row, known)], left=(0, 1, 2))
@@ -33,6 +42,19 @@ def results_text(results: Sequence[AnalysisResult], failed: Mapping[str, str]) -
     lines += _section("No value yet:", missing)
     lines += _section("Not possible:", failed)
     return lines
+
+
+def is_known(value: Value) -> bool:
+    """Whether a value has an error of at most half of it, or none."""
+    if value.value is None:
+        return False
+    return value.error is None or value.error <= MOST_UNCERTAIN * abs(value.value)
+
+
+def uncertain(value: Value) -> str:
+    """Why a value with an error is not known."""
+    number = format_with_error(not_none(value.value), value.error)
+    return f"{number} {value.unit} is too uncertain"
 
 
 def row(value: Value) -> tuple[str, str, str, str]:

@@ -21,6 +21,8 @@ from rigidmd.commands import cli
 from rigidmd.errors import OutputError, SceneError
 from rigidmd.features.analysis import registry
 from rigidmd.features.analysis.files import read_table
+from rigidmd.features.analysis.report import results_text
+from rigidmd.features.analysis.result import AnalysisResult, Value
 from rigidmd.features.analysis.rigid_frames import frames_of_folder
 from rigidmd.run.record import read_record
 
@@ -669,3 +671,17 @@ def test_figures_are_of_the_requested_type(copy, capsys):
             "density_profile.csv",
             f"density_profile.{kind}",
         }
+
+
+def test_a_value_with_a_large_error_is_not_known_yet():
+    values = [
+        Value("firm", "1", 4.0, 2.0, None, ""),
+        Value("vague", "D", 28.0, 101.0, None, ""),
+        Value("mean total dipole along x", "D", 4.0, 1.0, None, ""),
+    ]
+    result = AnalysisResult("test", "a test", values)
+    text = "\n".join(results_text([result], {}))
+    table, missing = text.split("No value yet:")
+    assert "firm" in table and "vague" not in table and "dipole" not in text
+    assert "vague: 28 ± 101 D is too uncertain" in " ".join(missing.split())
+    assert "dipole" in "\n".join(results_text([result], {}, verbose=True))

@@ -167,6 +167,6 @@ def _analyse_scene(path: str, names: list[str], more: dict[str, object], *, verb
 def print_results(results: list, failed: dict[str, str], *, verbose: bool) -> None:
     from rigidmd.features.analysis.report import results_text
 
-    print(*results_text(results, failed), sep="\n")
+    print(*results_text(results, failed, verbose=verbose), sep="\n")
     if verbose:
         print(*("", *results), sep="\n")
