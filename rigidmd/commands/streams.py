@@ -30,8 +30,11 @@ def progress_bar(begins: str = "") -> Iterator[Callable]:
     """
     from tqdm import tqdm
 
+    from rigidmd.io.progress import columns
+
     form = "{l_bar}{bar}| [{elapsed}<{remaining}]"  # the left part has the description
-    with tqdm(total=1.0, disable=None, leave=False, bar_format=form) as bar:
+    options = {"disable": None, "leave": False, "bar_format": form, "ncols": columns()}
+    with tqdm(total=1.0, **options) as bar:
 
         def progress(fraction: float, description: str = "") -> None:
             if begins and fraction == 0:

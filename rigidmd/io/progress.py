@@ -5,6 +5,7 @@ import io
 import sys
 import threading
 import time as clock
+from shutil import get_terminal_size
 from typing import TYPE_CHECKING, TextIO, TypedDict, Unpack
 
 from tqdm import tqdm
@@ -69,6 +70,7 @@ def progress_of(
         return _Lines(total=total, unit=unit)
     return Bar(
         total=total,
+        ncols=columns(),
         bar_format="{l_bar}{bar}| {n:.1f}/{total:.1f} " + unit + " [{elapsed}<{remaining}]",
     )
 
@@ -84,6 +86,12 @@ class BarOptions(TypedDict, total=False):
     file: TextIO
     mininterval: float
     delay: float
+    ncols: int
+
+
+def columns() -> int:
+    """The width of a bar. A terminal that does not have its size counts as one of 80 columns."""
+    return get_terminal_size((80, 24)).columns - 1
 
 
 class Bar(tqdm):
