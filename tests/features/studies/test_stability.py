@@ -167,7 +167,7 @@ def test_the_command_writes_its_files_and_does_not_overwrite(tmp_path, capsys):
     arguments = ["stability", "--quick", "--case", "inertia_scale", "-o", str(tmp_path / "out")]
     assert main(arguments) == 0
     printed = capsys.readouterr()
-    assert printed.out.startswith("passed: 1 cases, 6 runs: 6 right;")
+    assert printed.out.startswith("passed: 6 of 6 runs in 1 case; 6 right")
     assert "warning:" not in printed.err
     assert "\ninertia_scale  velocity_verlet, exact rotor " in printed.out
     with (tmp_path / "out" / "stability.csv").open() as file:

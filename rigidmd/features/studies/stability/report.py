@@ -42,7 +42,7 @@ VERDICTS = {
     CRASH: ("an exception that is not an error of rigidmd", BAD),
 }
 FILES = ("stability.csv", "stability.html")
-HEADERS = "case,integrator,runs,verdicts,largest error,of allowed,longest step,beyond,seconds"
+HEADERS = "case,integrator,runs,verdicts,largest error,limit,longest step,beyond,seconds"
 COLUMNS = (
     "case,group,kind,setting,integrator,step,step_unit,error,allowed,conserved_error,verdict,"
     "expected,beyond,seconds,message"
@@ -72,11 +72,12 @@ def conclusions(results: Results) -> list[str]:
     runs = sum(counts.values())
     cases = len({result.case.name for result in results})
     warnings = sum(len(result.warnings) for result in results)
-    total = (
-        f"{'failed' if failures else 'passed'}: {cases} cases, {runs} runs: {verdicts};"
-        f" {len(results) - runs} longest steps bisected; {warnings} warnings"
-        f"{', which -v lists' if warnings else ''}"
-    )
+    bisected = len(results) - runs
+    good = runs - sum(bool(result.failure) for result in results if result.limit is None)
+    parts = [f"{good} of {runs} runs in {cases} case{'s' * (cases > 1)}", verdicts]
+    parts += [f"{bisected} longest steps bisected"] * bool(bisected)
+    parts += [f"{warnings} warnings, which -v lists"] * bool(warnings)
+    total = f"{'failed' if failures else 'passed'}: {'; '.join(filter(None, parts))}"
     return [total, *failures, *filter(None, unexpected)]
 
 
