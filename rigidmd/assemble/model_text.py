@@ -18,7 +18,7 @@ def models_table(molecules: list[Molecule]) -> str:
     """A line for each model, by groups, at most WIDTH columns wide."""
     groups = []
     for group in GROUPS:
-        lines = [f"{group:<20}sites   mass u dipole D  {'charges e':<22}source"]
+        lines = [f"{group:<20}sites   mass u dipole D  {'charges, e':<22}source"]
         for m in [m for m in molecules if m.group == group]:
             dipole = f"{m.dipole_debye:.3f}" if m.charges.any() and m.radius > 0 else ""
             charges = " ".join(dict.fromkeys(f"{q:+.4g}" for q in m.charges if q))

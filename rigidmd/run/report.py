@@ -359,8 +359,8 @@ def stage_notes(stage: dict) -> list[str]:
         side = "above" if off > 0 else "below"
         advice = "" if is_expected else ", so equilibrate longer"
         notes.append(
-            f"{name} is {abs(off):.2g} K {side} the set point before; ± {size:.2g} K is"
-            f" expected{advice} at constant energy"
+            f"{name} is {abs(off):.2g} K {side} the set point of the stage before; ± {size:.2g} K"
+            f" is expected{advice} at constant energy"
         )
     return notes
 

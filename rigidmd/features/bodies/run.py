@@ -396,7 +396,7 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
         return (
             f"{self.scene.name}: one body ({system.kind}{pinned}), {system.degrees_of_freedom}"
             f" degrees of freedom; {run.steps} steps of {run.timestep_s:g} s,"
-            f" {run.integrator.replace('_', ' ')}"
+            f" {run.integrator}"
         )
 
     def start_energy(

@@ -36,6 +36,16 @@ class CellDifference:
     bits: int | None
 
 
+#: Units of the state of molecules.
+UNITS = {
+    "position": "Å",
+    "velocity": "Å/ps",
+    "angular_momentum_body": "u Å²/ps",
+    "cell": "Å",
+    "time": "ps",
+}
+
+
 @dataclass
 class SampleComparison:
     """Samples of two runs, matched by their steps or, with unlike steps, by their times."""
@@ -221,14 +231,21 @@ def describe_run_comparison(found: RunComparison) -> str:
         (name, ["the same bytes" if same else "other bytes"]) for name, same in found.files.items()
     ]
     if found.state:
+        is_molecular = found.samples is None or found.samples.file == Molecules.samples_file
+        units = UNITS if is_molecular else {}
         by = {
-            name: "in shape" if value is None else f"by up to {value:.3g}"
+            name: "in shape"
+            if value is None
+            else f"by up to {value:.3g} {units.get(name, '')}".rstrip()
             for name, value in found.state.items()
         }
+        samples = found.samples
+        is_longer = samples is not None and samples.lengths[0] != samples.lengths[1]
+        lengths = " (different lengths)" if is_longer else ""
         rows.append(
             (
                 FINAL,
-                [f"differs: {', '.join(f'{name} {how}' for name, how in by.items())} (u, Å, ps)"],
+                [f"differs{lengths}: {', '.join(f'{name} {how}' for name, how in by.items())}"],
             )
         )
     elif (

@@ -155,5 +155,9 @@ def _describe(modes: "NormalModes") -> Iterator[str]:
             f"  longest stable step of velocity Verlet {modes.longest_step_fs:.3g} fs, set by"
             f" {mode}"
         )
-    shown = [k for k in table.rows if k < ROWS or k > last - ROWS]
+    zero = [k for k in table.rows if modes.rate[k] == 0]
+    if len(zero) > 1:
+        yield f"  zero: modes {zero[0] + 1} to {zero[-1] + 1}"
+    moving = [k for k in table.rows if k not in zero]
+    shown = [*moving[:ROWS], *[k for k in moving[ROWS:] if k > last - ROWS]]
     yield "\n" + table._replace(rows=shown).text()

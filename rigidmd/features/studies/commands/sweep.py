@@ -242,6 +242,8 @@ def _print_results(manifest: "Manifest", step: str | None) -> None:
     table, files = collect(manifest)
     if files:
         print(table.brief().text(left=()))
+        if any(row.count == 2 for row in table.rows):
+            print("\n  Two runs give no usable error: use more replicas")
     for name, reason in table.failed.items():
         print(f"  {name} is not in the table: {reason}")
     for point in manifest.points_in("waiting", "interrupted")[:MOST_NAMED]:
