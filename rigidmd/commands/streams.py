@@ -30,10 +30,16 @@ def progress_bar(begins: str = "") -> Iterator[Callable]:
     """
     from tqdm import tqdm
 
-    from rigidmd.io.progress import columns
+    from rigidmd.io.progress import ROWS, columns
 
     form = "{l_bar}{bar}| [{elapsed}<{remaining}]"  # the left part has the description
-    options = {"disable": None, "leave": False, "bar_format": form, "ncols": columns()}
+    options = {
+        "disable": None,
+        "leave": False,
+        "bar_format": form,
+        "ncols": columns(),
+        "nrows": ROWS,
+    }
     with tqdm(total=1.0, **options) as bar:
 
         def progress(fraction: float, description: str = "") -> None:

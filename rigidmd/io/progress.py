@@ -71,6 +71,7 @@ def progress_of(
     return Bar(
         total=total,
         ncols=columns(),
+        nrows=ROWS,
         bar_format="{l_bar}{bar}| {n:.1f}/{total:.1f} " + unit + " [{elapsed}<{remaining}]",
     )
 
@@ -87,6 +88,10 @@ class BarOptions(TypedDict, total=False):
     mininterval: float
     delay: float
     ncols: int
+    nrows: int
+
+
+ROWS = 24  # of a terminal, which limits how many bars it shows
 
 
 def columns() -> int:
