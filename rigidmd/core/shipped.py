@@ -42,7 +42,7 @@ GUIDES = {
 }
 #: Folders of the documentation and their chapters, in the order of the list.
 SECTIONS = {
-    "start": ("installation", "five_minutes", "why", "contents"),
+    "start": ("installation", "why", "contents"),
     "tutorials": ("water", "top", "molecule", "notebook"),
     "guides": tuple(name for names in GUIDES.values() for name in names),
     "theory": ("dynamics", "bodies", "interactions", "sampling", "errors", "zero_step"),
