@@ -61,7 +61,6 @@ SECTIONS = {
         "benchmarks",
         "accuracy_cost",
         "time_step_water",
-        "collection",
         "validation",
         "robustness",
     ),

@@ -1,13 +1,13 @@
-"""The collection: error against run time of all integrators in ten scenes, with a page of the
+"""The collection: error against run time of all integrators in ten scenes, with a section of the
 documentation.
 
     python tests/benchmarks/collection.py            # measures what is missing, half an hour; NAME ... only these
     python tests/benchmarks/collection.py --force    # measures again
-    python tests/benchmarks/collection.py --pages    # draws the figures and writes the page, from the data
+    python tests/benchmarks/collection.py --pages    # draws the figures and writes the section, from the data
 
 writes evidence/data/collection/NAME.json (what is fastest, versions, machine; of the scenes in figures
 also NAME.csv with all trials), images/collection_water.png, collection_top.png and error_time.png,
-and evidence/collection.md in rigidmd/docs, or the folder of --to.
+and the section *Ten scenes* of evidence/accuracy_cost.md in rigidmd/docs, or the folder of --to.
 """
 
 import csv
@@ -103,7 +103,7 @@ SCENES = {
 }
 
 
-#: Figure of the page -> its scene; the scenes, titles and integrators of the figure of README.
+#: Figure of the section -> its scene; the scenes, titles and integrators of the figure of README.
 FIGURES = {"collection_water": "water_pme", "collection_top": "heavy_top_3"}
 README = (
     ("water_pme", "216 SPC/E waters, PME, 0.1 ps", "kT per degree of freedom"),
@@ -266,16 +266,17 @@ def draw_error_time(data: Path, images: Path) -> None:
 
 def machines_of(found: dict[str, dict]) -> str:
     """Versions, machine and dates of all scenes."""
-    lines = dict.fromkeys(
-        ", ".join(f"{package} {number}" for package, number in facts["versions"].items())
-        + f", Python {facts['python']}, {facts['processor']}, one thread, {facts['date']}"
-        for facts in found.values()
-    )
+    dates: dict[str, set[str]] = {}
+    for facts in found.values():
+        versions = [f"{package} {number}" for package, number in facts["versions"].items()]
+        setup = ", ".join([*versions, f"Python {facts['python']}", facts["processor"]])
+        dates.setdefault(setup, set()).add(facts["date"])
+    lines = [f"{setup}, one thread, {', '.join(sorted(days))}" for setup, days in dates.items()]
     return "Measured with " + "; with ".join(lines) + "."
 
 
 def page_text(docs: Path = DOCS) -> str:
-    """The page, from the data."""
+    """The page with its section between the two comments written from the data."""
     data = data_of(docs)
     found = {
         name: json.loads((data / f"{name}.json").read_text(encoding="utf-8"))
@@ -284,48 +285,46 @@ def page_text(docs: Path = DOCS) -> str:
     }
     heads = [f"energy error of {target:.0e}" for target in TARGETS]
     rows = [summary_row(name, facts) for name, facts in found.items()]
-    return PAGE.format(table=table(["scene", *heads], rows), machines=machines_of(found))
+    section = SECTION.format(table=table(["scene", *heads], rows), machines=machines_of(found))
+    page = (DOCS / PAGE).read_text(encoding="utf-8")
+    before, after = page.partition(FIRST)[0], page.partition(LAST)[2]
+    return before + FIRST + section + LAST + after
 
 
-PAGE = """# Collection
-
-Error against run time of every integrator in ten scenes: the fastest for three errors, and two figures.
-
-<!-- written by python tests/benchmarks/collection.py from data/collection; do not edit -->
-
-One command measures all scenes, draws the figures and writes this page:
-
+PAGE = Path("evidence", "accuracy_cost.md")
+FIRST = (
+    "<!-- written by python tests/benchmarks/collection.py from data/collection; do not edit -->\n"
+)
+LAST = "<!-- end of what collection.py writes -->\n"
+SECTION = """
 <!-- test: not run, it takes half an hour -->
 ```sh
 python tests/benchmarks/collection.py
 ```
 
-Each row has the fastest integrator for three errors of the energy, and how many times faster than
-`velocity_verlet` it is at that error. The factor is left out where `velocity_verlet` is the fastest or does not reach
-the error with its shortest step. The unit is kT per degree of freedom for molecules, over 0.1 ps, and the largest kinetic
-energy for a body, over its run. High orders need smooth forces, so all molecules have
-`forces.truncation = "smooth_switch"`. The run time is the median of three timings on a shared machine; a factor within
-their spread is not printed.
+Each row has the fastest integrator for three errors of the energy, and how many times faster than `velocity_verlet` it is at that
+error, where `velocity_verlet` is slower and reaches the error. The unit is kT per degree of freedom for molecules, over 0.1 ps, and
+the largest kinetic energy for a body, over its run. All molecules have `truncation = "smooth_switch"`. The run time is the median
+of three timings on a shared machine.
 
 {table}
 
-The figures have the error against force evaluations, which do not depend on the machine, for water with PME and for the
-heavy top. Each curve joins the trials of an integrator in the order of the step.
+Force evaluations do not depend on the machine. Each curve joins the trials of an integrator in the order of the step.
 
-![error of integrators against force evaluations, water](../images/collection_water.png)
+![error of integrators against force evaluations, water with PME](../images/collection_water.png)
 
 ![error of integrators against force evaluations, heavy top](../images/collection_top.png)
 
-A curve ends at a floor, where a shorter step does not reduce the error: the rounding error, or with PME the error
-of the grid and of the truncated real-space sum. There a method shows no order.
+A curve ends at a floor, where a shorter step does not reduce the error: the rounding error, or with PME the error of the grid and
+of the truncated real-space sum. There a method shows no order.
 
-{machines} Longest steps, failures and the fastest integrators for other errors are in
-`rigidmd/docs/evidence/data/collection`.
+{machines} Longest steps, failures and the fastest integrators for other errors are in `rigidmd/docs/evidence/data/collection`.
+
 """
 
 
 def main() -> None:
-    """Measure the scenes, and write the page."""
+    """Measure the scenes, and write the section."""
     parser = new_parser(__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME")
     parser.add_argument("--force", action="store_true")
@@ -351,7 +350,7 @@ def main() -> None:
     if all((data / f"{name}.csv").is_file() for name, *_ in README):
         draw_error_time(data, images)
     (docs / "evidence").mkdir(exist_ok=True)
-    (docs / "evidence" / "collection.md").write_text(page_text(docs), encoding="utf-8")
+    (docs / PAGE).write_text(page_text(docs), encoding="utf-8")
 
 
 if __name__ == "__main__":
