@@ -43,10 +43,10 @@ WEIGHTS = {"start": 2, "tutorials": 2, "guides": 2, "evidence": 0.5, "project": 
 SYNONYMS = {
     "chemical_potential": ["chemical potential"],
     "npt": ["density"],
+    "potentials": ["own potential", "custom potential", "user-defined potential"],
     "resume": ["continue", "restart"],
     "run_times": ["how long", "speed"],
     "slab": ["surface tension"],
-    "tables": ["own potential", "custom potential", "user-defined potential"],
 }
 HEADING_OR_KEY = re.compile(r"^##+ (?P<heading>.+)$|^\| `(?P<key>\w+)`", re.MULTILINE)
 CODE_OR_COMMENT = re.compile(

@@ -26,7 +26,7 @@ _SHIPPED = re.compile(r"systems/(?:scripts/|notebooks/)?(\w+)(\.toml|\.ipynb|\.p
 KINDS = {".toml": "scene", ".ipynb": "notebook", ".py": "script"}
 #: Guides by what they are for.
 GUIDES = {
-    "Set up": ("structures", "electrostatics", "tables", "body_pairs", "ensembles"),
+    "Set up": ("structures", "electrostatics", "potentials", "ensembles"),
     "Run": ("npt", "slab", "time_step", "run_times", "resume", "troubleshooting"),
     "Analyse": (
         "analysis",

@@ -151,7 +151,6 @@ TIERS = {
             for page in (
                 "analysis",
                 "ase",
-                "body_pairs",
                 "chemical_potential",
                 "engines",
                 "ensembles",
@@ -162,6 +161,7 @@ TIERS = {
                 "normal_modes",
                 "npt",
                 "pictures",
+                "potentials",
                 "python",
                 "resume",
                 "robustness",
@@ -169,7 +169,6 @@ TIERS = {
                 "slab",
                 "structures",
                 "studies",
-                "tables",
                 "time_step",
                 "time_step_water",
                 "top",
