@@ -633,6 +633,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             "unit": unit,
             "molecules": n,
             "overlap_removal_steps": removal.steps if removal else 0,
+            "before_minimisation": self.scene.stages[0].is_minimisation,
             "notes": [*self.system.notes, *self.system.warnings],
             "components": {name: energy / size for name, energy in observation.components.items()},
             "potential": observation.potential / size,

@@ -367,19 +367,24 @@ def stage_notes(stage: dict) -> list[str]:
 
 def energy_lines(name: str, energies: Json, unit: str) -> list[str]:
     """Energies of the start of molecules, of `MolecularRun.start_energy`, as text."""
-    steps = energies["overlap_removal_steps"]
-    removal = f", after {steps} steps of overlap removal" if steps else ""
-    lines = [f"{name}: energies of the start, {energies['molecules']} molecules{removal}"]
+    molecules, steps = energies["molecules"], energies["overlap_removal_steps"]
+    title = f"{name}: {molecules} molecules at the start"
+    title += ", before the minimisation" * energies["before_minimisation"]
+    lines = [f"{title}, after {steps} steps of overlap removal" if steps else title]
     lines += [f"  {note}" for note in energies["notes"]]
-    rows = [(term.replace("_", " "), value, unit) for term, value in energies["components"].items()]
-    rows += [(key, energies[key], unit) for key in ("potential", "kinetic", "virial")]
-    if (lattice_energy := energies["lattice_energy_per_molecule"]) is None:
-        rows += [("per molecule", energies["potential_per_molecule"], f"{unit}, potential")]
-    else:
-        rows += [("lattice energy", lattice_energy, f"{unit} per molecule")]
-    rows += (
-        [] if energies["pressure_bar"] is None else [("pressure", energies["pressure_bar"], "bar")]
-    )
+    terms = energies["components"] | {
+        key: energies[key] for key in ("potential", "kinetic", "virial")
+    }
+    lines.append(f"  {f'energies ({unit})':<22}{'total':>22}{'per molecule':>22}")
+    lines += [
+        f"  {term.replace('_', ' '):<22}{value:>22.10g}{value / molecules:>22.10g}"
+        for term, value in terms.items()
+    ]
+    rows = []
+    if (lattice_energy := energies["lattice_energy_per_molecule"]) is not None:
+        rows.append(("lattice energy", lattice_energy, f"{unit} per molecule"))
+    if energies["pressure_bar"] is not None:
+        rows.append(("pressure", energies["pressure_bar"], "bar"))
     where = f"{unit}/Å on molecule {energies['largest_force_molecule']}"
     rows.append(("largest force", energies["largest_force_per_A"], where))
     lines += value_lines(rows, ">22.10g")

@@ -7,6 +7,7 @@ from support.common import observe, small_scene
 from support.ewald import SALT
 from support.reference import KE
 
+from rigidmd.core.shipped import SYSTEMS
 from rigidmd.run import Simulation
 from rigidmd.units import BAR, KJ_PER_MOL
 
@@ -78,3 +79,17 @@ duration_ps = 1
     told = printed("energy", scene).out
     assert f"  coulomb: {words}\n" in told
     assert "  virial: sum of F·R over molecules\n" in told
+
+
+def test_energies_are_in_total_and_per_molecule(printed):
+    """Columns are aligned, and the title states that a minimisation follows."""
+    water = printed("energy", SYSTEMS / "water.toml").out.splitlines()
+    assert water[0] == "water: 216 molecules at the start, before the minimisation"
+    header = next(line for line in water if "per molecule" in line)
+    potential = next(line for line in water if line.startswith("  potential"))
+    assert header.split() == ["energies", "(kJ/mol)", "total", "per", "molecule"]
+    total, per_molecule = map(float, potential.split()[1:])
+    assert total / 216 == pytest.approx(per_molecule, rel=1e-9)
+    assert len(header) == len(potential)
+    dimer = printed("energy", SYSTEMS / "water_dimer.toml").out.splitlines()
+    assert dimer[0] == "water_dimer: 2 molecules at the start"
