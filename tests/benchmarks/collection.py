@@ -136,7 +136,7 @@ def measure(name: str, docs: Path) -> None:
             for n in dict.fromkeys(t.integrator for t in found.trials)
         }
         reached[f"{target:.0e}"] = {
-            n: [p.seconds, p.step, p.spread] for n, p in points.items() if p is not None
+            n: [p.time, p.step, p.spread] for n, p in points.items() if p is not None
         }
     processor = next(
         line

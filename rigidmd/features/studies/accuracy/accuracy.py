@@ -2,7 +2,7 @@
 of a scene. As a table, recommendations, accuracy.csv, .png and a self-contained page."""
 
 from collections.abc import Callable, Iterator
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import cast
 
@@ -27,7 +27,7 @@ from rigidmd.features.studies.accuracy.start import (
 from rigidmd.features.studies.kind_study import AccuracyStart, study_of
 from rigidmd.features.view.figures.style import write_figure
 from rigidmd.features.view.page import chips, code, items, section, table, wide, write_page
-from rigidmd.io.write import Column, ReportTable, columns_text
+from rigidmd.io.write import Column, ReportTable
 from rigidmd.run.force_errors import single_precision_errors
 from rigidmd.run.trial_systems import (
     COMPARATORS,
@@ -198,13 +198,20 @@ def trial_table(measured: IntegratorAccuracy, *, marked: bool = False) -> Report
 def describe_accuracy(measured: IntegratorAccuracy, *, verbose: bool = False) -> list[str]:
     """The answer first: the fastest integrator for each error, measured orders, all trials, and
     remarks."""
-    fastest = [("target error", "fastest integrator", f"compared with {COMMON}")]
-    for error, best, faster, _ in cheapest(measured):
-        gain, _, _ = faster.partition(f" than {COMMON}")
-        fastest.append((error.removeprefix("an "), best, gain))
+    best = ReportTable(
+        [
+            Column("target error", lambda row: row[0].removeprefix("an ")),
+            Column(
+                "fastest integrator" if measured.is_timed else "fewest force evaluations",
+                itemgetter(1),
+            ),
+            Column(f"compared with {COMMON}", lambda row: row[2].partition(f" than {COMMON}")[0]),
+        ],
+        cheapest(measured),
+    )
     lines = [f"{measured.trial_system.name}, {_span(measured)}", ""]
-    if len(fastest) > 1:
-        lines += [columns_text(fastest, left=(0, 1, 2)), ""]
+    if best.rows:
+        lines += [best.text(left=(0, 1, 2)), ""]
     lines += [order_table(measured).text(), "", trial_table(measured, marked=True).text()]
     lines.append(f"{FLOOR_MARK} at the floor: a shorter step does not reduce this error")
     return [*lines, "", *(recommendations(measured) if verbose else remarks(measured))]
@@ -216,8 +223,10 @@ def recommendations(measured: IntegratorAccuracy) -> list[str]:
     lines = []
     for error, best, faster, rivals in cheapest(measured):
         faster = f": {faster}" if faster else ""
-        rivals = f". Equally fast within timing noise: {rivals}" if rivals else ""
-        lines.append(f"for {error} over {_span(measured)} the fastest is {best}{faster}{rivals}")
+        equal = "Equally fast within timing noise" if measured.is_timed else "As many"
+        rivals = f". {equal}: {rivals}" if rivals else ""
+        which = "the fastest is" if measured.is_timed else "the fewest force evaluations has"
+        lines.append(f"for {error} over {_span(measured)} {which} {best}{faster}{rivals}")
     if lines and s.time_unit == "fs":
         lines.append(
             "energy errors grow over longer runs, by a random walk where forces are truncated:"
@@ -281,10 +290,11 @@ def _describe_timings(measured: IntegratorAccuracy) -> list[str]:
         return []
     spread, worst = max(doubtful, key=lambda pair: pair[0])
     which = f"{worst.integrator} at {worst.timestep:.3g} {measured.trial_system.time_unit}"
+    ranked = "" if measured.is_timed else ". Force evaluations rank the integrators"
     return [
         f"warning: repeated timings of {len(doubtful)} of {len(timed)} trials differ by more than"
         f" {DOUBTFUL:.0%}, those of {which} by {spread:.0%} (± % in the table): was another program"
-        " running? An idle machine or more --repeats help"
+        f" running? An idle machine or more --repeats help{ranked}"
     ]
 
 
@@ -293,7 +303,8 @@ COMMON = "velocity_verlet"  # integrator to compare with
 
 def cheapest(measured: IntegratorAccuracy) -> list[tuple[str, str, str, str]]:
     """For each error of the energy, and of Q or X: the cheapest integrator, how much faster than
-    `COMMON` it is, others that are as fast. Errors with the same answer are one row."""
+    `COMMON` it is, others that are as fast. Errors with the same answer are one row. Where timings
+    scatter too much, force evaluations rank the integrators."""
     s = measured.trial_system
     rows = []
     unit = s.time_unit
@@ -317,18 +328,23 @@ def cheapest(measured: IntegratorAccuracy) -> list[tuple[str, str, str, str]]:
             blind = error == "trajectory_error" and target < 3 * measured.reference_error
             if target > worst or len(reached) < 2 or blind:
                 continue
-            best = min(reached, key=lambda name: reached[name].seconds)
+            costs = {name: measured.cost(at) for name, at in reached.items()}
+            noise = {name: at.spread / 2 * measured.is_timed for name, at in reached.items()}
+            best = min(costs, key=lambda name: costs[name])
             at, common = reached.pop(best), reached.get(COMMON)
-            slow = at.seconds * (1 + at.spread / 2)
+            slow = costs[best] * (1 + noise[best])
             rivals = {
-                name: r.step for name, r in reached.items() if r.seconds * (1 - r.spread / 2) < slow
+                name: r.step
+                for name, r in reached.items()
+                if costs[name] * (1 - noise[name]) < slow
             }
             chosen = f"{best} at {at.step:.2g} {unit}{f' ({at.limit})' if at.limit else ''}"
             faster = ""
             if common and COMMON not in rivals:
+                gain = "times faster" if measured.is_timed else "times fewer"
                 faster = (
-                    f"{common.seconds / at.seconds:.1f} times faster than {COMMON} at"
-                    f" {common.step:.2g} {unit}"
+                    f"{costs[COMMON] / costs[best]:.1f} {gain} than {COMMON} at {common.step:.2g}"
+                    f" {unit}"
                 )
             others = ", ".join(f"{name} at {step:.2g} {unit}" for name, step in rivals.items())
             answers.setdefault((chosen, faster, others), []).append(target)
@@ -351,9 +367,9 @@ def _page_parts(measured: IntegratorAccuracy, command: str) -> Iterator[str]:
     colored = chips(measured.integrators)
     titles = [
         f"error over {_span(measured)}",
-        "least run time",
+        "least run time" if measured.is_timed else "fewest force evaluations",
         "gain",
-        "equally fast within timing noise",
+        "equally fast within timing noise" if measured.is_timed else "as many",
     ]
     advice = table(titles, cheapest(measured), words=True)
     drawn = wide(

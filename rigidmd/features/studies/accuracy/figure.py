@@ -16,7 +16,6 @@ from rigidmd.features.view.figures.style import (
     new_figure,
     open_axis,
 )
-from rigidmd.run.trials import Trial
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -56,8 +55,6 @@ def accuracy_figure(measured: IntegratorAccuracy, span: str) -> "Picture":
     for each integrator in the order of its steps. Rings mark the best trials, bars the time spread.
     span : of a trial, as text"""
     s = measured.trial_system
-    spreads = [t.spread for t in measured.trials if not t.diverged and t.spread is not None]
-    is_timed = not spreads or float(np.median(spreads)) <= DOUBTFUL
     figure = new_figure(9, 4.2)
     left, right = figure.subplots(1, 2)
     of = "Q" if measured.rotates else f"X ({s.length_unit})"
@@ -67,9 +64,9 @@ def accuracy_figure(measured: IntegratorAccuracy, span: str) -> "Picture":
     }
     for axis, (error, label) in zip((left, right), labels.items(), strict=True):
         for k, name in enumerate(measured.integrators):
-            _draw_trials(axis, measured.bounded(name, error), error, s.span, k, is_timed)
+            _draw_trials(axis, measured, name, error, k)
         front = [t for t in measured.front(error) if getattr(t, error) > 0]
-        points = [(_cost(t, s.span, is_timed), getattr(t, error), t.timestep) for t in front]
+        points = [(measured.cost(t) / s.span, getattr(t, error), t.timestep) for t in front]
         axis.loglog(
             [cost for cost, *_ in points],
             [error for _, error, _ in points],
@@ -78,14 +75,14 @@ def accuracy_figure(measured: IntegratorAccuracy, span: str) -> "Picture":
             mfc="none",
             mec=INK,
             mew=0.8,
-            label="fastest, with its step",
+            label=f"{'fastest' if measured.is_timed else 'cheapest'}, with its step",
         )
         _label_steps(axis, points, s.time_unit)
         axis.set_ylabel(label, fontsize=TITLE, color=INK)
         open_axis(axis, which="both")
         label_ticks(axis.xaxis)
         label_ticks(axis.yaxis)
-    cost = "run time (s)" if is_timed else "force evaluations"
+    cost = "run time (s)" if measured.is_timed else "force evaluations"
     figure.supxlabel(f"{cost} per {s.span_unit} of motion", color=INK, fontsize=TITLE)
     left.axhline(measured.reference_error, color=FAINT, lw=0.8, ls=":")
     left.annotate(
@@ -113,20 +110,18 @@ def _of_energy(unit: str) -> str:
     return f" ({unit})" if size == unit else f" / {size}"
 
 
-def _cost(trial: Trial, span: float, is_timed: bool) -> float:
-    return (trial.time if is_timed else trial.forces) / span
-
-
 def _draw_trials(
-    axis: "Axes", trials: list[Trial], error: str, span: float, k: int, is_timed: bool
+    axis: "Axes", measured: IntegratorAccuracy, integrator: str, error: str, k: int
 ) -> None:
     """Draw the curve of an integrator, dashed next to trials whose timings scatter."""
-    costs = np.array([_cost(t, span, is_timed) for t in trials])
+    trials, span = measured.bounded(integrator, error), measured.trial_system.span
+    is_timed = measured.is_timed
+    costs = np.array([measured.cost(t) / span for t in trials])
     errors = np.array([getattr(t, error) for t in trials])
     style = curve_style(k)
     uncertain = np.array([is_timed and (t.spread or 0.0) > DOUBTFUL for t in trials], bool)
     is_dashed = uncertain[1:] | uncertain[:-1]  # between neighbouring trials
-    label = trials[0].integrator if trials else None
+    label = integrator if trials else None
     solid, dashed = (
         [np.insert(values, 1 + np.flatnonzero(omitted), np.nan) for values in (costs, errors)]
         for omitted in (is_dashed, ~is_dashed)

@@ -59,6 +59,17 @@ class IntegratorAccuracy:
     def rotates(self) -> bool:
         return any(not np.isnan(trial.rotation_error) for trial in self.trials)
 
+    @property
+    def is_timed(self) -> bool:
+        """Whether timings rank the trials: half of their spreads are at most `DOUBTFUL`. Otherwise
+        force evaluations do."""
+        spreads = [t.spread for t in self.trials if not t.diverged and t.spread is not None]
+        return not spreads or float(np.median(spreads)) <= DOUBTFUL
+
+    def cost(self, trial: "Trial | ReachedError") -> float:
+        """Seconds of computing in a span, or force evaluations if timings scatter too much."""
+        return trial.time if self.is_timed else trial.forces
+
     def bounded(self, integrator: str, error: str = "timestep") -> list[Trial]:
         """The trials of an integrator that have not diverged and have an error (an attribute of
         `Trial`) above 0, with the longest step first."""
@@ -70,10 +81,10 @@ class IntegratorAccuracy:
         return sorted(trials, key=lambda trial: -trial.timestep)
 
     def front(self, error: str) -> list[Trial]:
-        """Trials that no other beats in both time and error (an attribute of `Trial`), fastest
+        """Trials that no other beats in both cost and error (an attribute of `Trial`), cheapest
         first."""
         fastest: list[Trial] = []
-        for trial in sorted((t for t in self.trials if not t.diverged), key=lambda t: t.time):
+        for trial in sorted((t for t in self.trials if not t.diverged), key=self.cost):
             if not fastest or getattr(trial, error) < getattr(fastest[-1], error):
                 fastest.append(trial)
         return fastest
@@ -105,17 +116,18 @@ class IntegratorAccuracy:
             limit = "its longest step tried"
         step = float(min(step, longest))
         up = tried[::-1]
-        seconds = np.exp(
-            np.interp(np.log(step), np.log([t.timestep for t in up]), np.log([t.time for t in up]))
-        )
+        steps = np.log([t.timestep for t in up])
+        costs = ([t.time for t in up], [t.forces for t in up])
+        time, forces = (float(np.exp(np.interp(np.log(step), steps, np.log(x)))) for x in costs)
         near = min(tried, key=lambda t: abs(np.log(t.timestep / step)))
-        return ReachedError(float(seconds), step, near.spread or 0.0, limit)
+        return ReachedError(time, forces, step, near.spread or 0.0, limit)
 
 
 class ReachedError(NamedTuple):
     """Where an integrator reaches an error."""
 
-    seconds: float  # of computing in a span
+    time: float  # seconds of computing in a span
+    forces: float  # evaluations in a span
     step: float  # in the unit of the system
     spread: float  # range of the nearest trial's seconds over their median
     limit: str  # text, where stability or the steps tried, and not the error, set the step
