@@ -81,6 +81,16 @@ def _line(message: str) -> float:
     return int(match[1]) if match else inf
 
 
+class Source(str):
+    """The name of an input in messages."""
+
+    __slots__ = ()
+
+    def locate(self, error: str) -> str:
+        """An error with its line, if the input has one for it."""
+        return error
+
+
 class InputError(RigidMDError):
     """Bad input, with all errors found.
 
@@ -94,6 +104,8 @@ class InputError(RigidMDError):
 
     def __init__(self, where: str, errors: list[str]):
         self.where = where
+        if isinstance(where, Source):
+            errors = [where.locate(error) for error in errors]
         self.errors = sorted(errors, key=_line)
         if len(self.errors) == 1:
             super().__init__(f"{where}: {self.errors[0]}")

@@ -47,7 +47,7 @@ def _check(options: Options) -> int:
     for warning in (*system.warnings, *kind.step_warnings(system)):
         warn(warning)
     for error in (errors := kind.step_errors(system)):
-        print(f"rigidmd: error: {scene.source}: {error}", file=sys.stderr)
+        print(f"rigidmd: error: {SceneError(scene.source, [error])}", file=sys.stderr)
     return FAILED if errors else 0
 
 

@@ -41,6 +41,7 @@ from rigidmd.formats import Format, format_of, written
 from rigidmd.scene.integrators import IntegratorRow, with_registered_rows
 from rigidmd.scene.validation import (
     MOST_TABLES,
+    SceneText,
     Section,
     exact_names,
     is_within,
@@ -345,7 +346,8 @@ class Scene(Section, Displayed):
             raise SceneError(
                 source, [fault + _removal_hint(fault, data, overridden) for fault in errors]
             )
-        scene._source, scene._folder, scene._embedded_files = source, folder, embedded_files or {}
+        scene._source = SceneText(source, text, overridden)
+        scene._folder, scene._embedded_files = folder, embedded_files or {}
         return scene
 
 

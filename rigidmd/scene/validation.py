@@ -25,7 +25,7 @@ from pydantic_core import ErrorDetails, PydanticKnownError, core_schema
 from rigidmd.core.plain_text import did_you_mean, plain_letters
 from rigidmd.core.toml import Json, line_of, shorten_repr, shorten_text, values_in
 from rigidmd.core.user_warnings import warn_renamed
-from rigidmd.errors import MOST_SHOWN, RigidMDWarning, option
+from rigidmd.errors import MOST_SHOWN, RigidMDWarning, Source, option
 from rigidmd.scene.hints import KEY_WITH_UNIT, OTHER_UNITS, hint_on_key, in_british, models_in
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
@@ -188,7 +188,9 @@ def validation_messages(
             keys = keys[:-1]  # the list lacks an entry
         fault = detail.get("ctx", {}).get("error")
         if not keys and isinstance(fault, Contradictions):
-            of_tables += [_with_line(message, text) for message in fault.messages]
+            for message in fault.messages:
+                located = SceneText("", text).locate(message)
+                of_tables.append(f"scene: {message}" if located == message else located)
             continue
         # Messages beyond the number shown are only counted.
         sentence = _sentence(detail, keys, model) if len(errors) <= MOST_SHOWN else detail["msg"]
@@ -207,12 +209,28 @@ def validation_messages(
     ]
 
 
-def _with_line(message: str, text: str) -> str:
-    """A message with the line of the key that it begins with."""
-    path = re.match(r"\w+(\.\w+)*", message)
-    keys = [int(key) if key.isdigit() else key for key in path[0].split(".")] if path else []
-    line = line_of(keys, text) if keys else None
-    return f"line {line}: {message}" if line else f"scene: {message}"
+class SceneText(Source):
+    """The name of a scene in messages, with the text of its file.
+
+    overridden : keys that are set by the command line and have no line
+    """
+
+    text: str
+    overridden: tuple[str, ...]
+
+    def __new__(cls, name: str, text: str = "", overridden: Iterable[str] = ()):
+        source = super().__new__(cls, name)
+        source.text, source.overridden = text, tuple(overridden)
+        return source
+
+    def locate(self, error: str) -> str:
+        """An error with the line of the key that it begins with: "stages.0: timestep_fs = 20 is
+        unstable" with that of timestep_fs."""
+        path = re.match(r"\w+(\.\w+)*(: \w+)?", error)
+        names = path[0].replace(": ", ".") if path else ""
+        keys = [int(key) if key.isdigit() else key for key in names.split(".")]
+        line = None if is_within(names, self.overridden) else line_of(keys, self.text)
+        return f"line {line}: {error}" if line else error
 
 
 def _is_meant(missing: tuple, errors: dict[tuple, list[str]]) -> bool:

@@ -1,5 +1,6 @@
 """Bad scenes: each has one message that states what, where and what to do; nothing is written and no traceback shown."""
 
+import pickle
 import re
 import tomllib
 
@@ -7,6 +8,7 @@ import pytest
 from support.common import refused, small_scene
 from support.scenes import GOOD
 
+from rigidmd.assemble.build import build
 from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError
 from rigidmd.scene import Scene, parse_override
@@ -633,3 +635,27 @@ def test_a_bracket_that_is_not_closed_has_line_and_position(tmp_path):
     assert f"line {line}: forces.custom.0.energy: the bracket at position 6 is not closed" in str(
         error.value
     )
+
+
+def test_errors_after_reading_have_the_line_of_their_first_key(tmp_path):
+    """Checks of the resolved scene, unless the command line has set the key."""
+    path = tmp_path / "scene.toml"
+    path.write_text(
+        '[box]\nlengths_A = 11\n[[molecules]]\nmodel = "spce"\ncount = 8\n[forces]\ncutoff_A = 6\n'
+        '[start]\ntemperature_K = 300\n[[stages]]\nensemble = "nve"\nduration_ps = 1\n'
+    )
+    with pytest.raises(SceneError) as wrong:
+        build(Scene.read(path))
+    assert wrong.value.errors[0].startswith("line 7: forces.cutoff_A = 6 is longer than half")
+    with pytest.raises(SceneError) as wrong:
+        build(Scene.read(path, {"forces.cutoff_A": 7.0}))
+    assert wrong.value.errors[0].startswith("forces.cutoff_A = 7 is longer than half")
+    source = Scene.read(path, {"forces.cutoff_A": 5.0}).source
+    assert source == str(path)
+    assert pickle.loads(pickle.dumps(source)).locate("stages.0: duration_ps is") == (
+        "line 12: stages.0: duration_ps is"
+    )
+    assert str(SceneError(source, ["stages.0: an npt stage"])).endswith(
+        "line 10: stages.0: an npt stage"
+    )
+    assert source.locate("molecules overlap") == "molecules overlap"
