@@ -25,7 +25,6 @@ from rigidmd.mechanics.free_rotor import NoRotor
 from rigidmd.scene.molecules import name_of
 from rigidmd.units import BAR, KJ_PER_MOL
 
-FIRST_RUN = "The first run also compiles for up to a minute"
 WIDTH = 100  # of lines of the report, columns
 #: Precision of forces, for reports. Times: docs/evidence/benchmarks.md.
 PRECISIONS = {
@@ -77,7 +76,10 @@ def _stage_lines(system: System) -> list[str]:
     if (seconds := expected_seconds(system)) is not None:
         count = usable_threads(scene.threads)
         threads = f"{count} thread{'s' * (count > 1)}"
-        lines.append(f"run time: about {in_words(seconds)} on {threads}. {FIRST_RUN}")
+        lines.append(
+            f"run time: about {in_words(seconds)} on {threads}. The first run also"
+            " compiles for up to a minute"
+        )
     return lines
 
 

@@ -37,7 +37,7 @@ from support.page_figures import FIGURES, SCRIPTS
 from rigidmd.commands import cli
 from rigidmd.commands.arguments import read_scene
 from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
-from rigidmd.core.shipped import CHAPTERS, DOCS, GUIDES, SECTIONS, find_example
+from rigidmd.core.shipped import CHAPTERS, DOCS, GUIDES, SECTIONS, examples, find_example
 from rigidmd.errors import SceneError
 from rigidmd.formats import BY_EXTENSION, all_formats
 from rigidmd.run.kind import with_defaults
@@ -661,6 +661,20 @@ def models_tables() -> str:
     return "\n\n".join(f"## {GROUPS[group]}\n\n{head}{tables[group]}" for group in GROUPS) + "\n"
 
 
+def bodies_table() -> str:
+    """The end of reference/body.md, from the first lines of the shipped scenes of bodies."""
+    rows = [f"| `{one.name}` | {one.about} |" for one in examples() if "body" in one.tables]
+    head = (
+        "## Shipped bodies\n\n`rigidmd new NAME` copies a scene.\n\n| scene | motion |\n|---|---|\n"
+    )
+    return head + "\n".join(rows) + "\n"
+
+
+def test_the_page_of_bodies_lists_the_shipped_ones():
+    """`PYTHONPATH=tests python tests/rules/test_docs.py` writes the list."""
+    assert PAGES["body"].read_text(encoding="utf-8").endswith("\n" + bodies_table())
+
+
 def test_the_table_of_integrators_has_their_orders_and_costs():
     table = section("Shipped integrators")
     rows = {}
@@ -683,6 +697,8 @@ if __name__ == "__main__":
     text = PAGES["models"].read_text(encoding="utf-8")
     PAGES["models"].write_text(text[: text.index("## Water")] + models_tables(), encoding="utf-8")
     PAGES["contents"].write_text(contents_text(), encoding="utf-8")
+    text = PAGES["body"].read_text(encoding="utf-8").partition("## Shipped bodies")[0]
+    PAGES["body"].write_text(text + bodies_table(), encoding="utf-8")
 
 
 def test_the_section_of_the_collection_is_written_from_its_data(monkeypatch):

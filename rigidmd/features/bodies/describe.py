@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rigidmd.assemble.describe import FIRST_RUN, class_words, report
+from rigidmd.assemble.describe import class_words, report
 from rigidmd.assemble.run_time import in_words
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.features.bodies.system import BodySystem
@@ -51,7 +51,9 @@ def _run_lines(system: BodySystem) -> list[str]:
     elif isinstance(system.method, Scheme):
         forces = run.steps * system.method.force_evaluations
         seconds = START_S + FORCES_S * forces + SAMPLE_S * run.steps / every
-        lines.append(f"run time: about {in_words(seconds)}. {FIRST_RUN}")
+        lines.append(
+            f"run time: about {in_words(seconds)}. The first run also compiles for ten seconds"
+        )
     return lines
 
 
