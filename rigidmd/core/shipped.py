@@ -64,7 +64,7 @@ SECTIONS = {
         "validation",
         "robustness",
     ),
-    "project": ("contributing", "architecture", "changelog"),
+    "project": ("contributing", "changelog"),
 }
 CHAPTERS = {
     name: DOCS / folder / f"{name}.md" for folder, names in SECTIONS.items() for name in names
