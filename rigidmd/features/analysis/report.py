@@ -9,7 +9,14 @@ from rigidmd.scene.validation import not_none
 
 DETAILS = "mean total dipole"  # begin of the names of values that are printed on request
 MOST_UNCERTAIN = 0.5  # the largest error of a value that is known, relative to it
-HEADERS = ("quantity", "value", "unit", "correlation time (ps)")
+TIME = "correlation time (ps)"
+HEADERS = ("quantity", "value", "unit", TIME)
+#: Values of g(r) by the end of their names -> headers. A pair of sites has one row.
+PEAK = {
+    "first peak": "first peak (Å)",
+    "height of that peak": "height",
+    "neighbours up to the first minimum": "neighbours",
+}
 
 
 def frames_text(count: int, begin: float, end: float) -> str:
@@ -35,9 +42,13 @@ def results_text(
     known = [value for value in values if is_known(value)]
     missing = {value.name: value.note or uncertain(value) for value in values if value not in known}
     lines = []
-    if known:
-        table = columns_text([HEADERS, *map(row, known)], left=(0, 1, 2))
+    pairs = _pairs(known)
+    if others := [value for value in known if _pair(value) is None]:
+        table = columns_text([HEADERS, *map(row, others)], left=(0, 1, 2))
         lines = ["", *_indented(table.splitlines())]
+    if pairs:
+        table = columns_text([("g(r)", *PEAK.values(), TIME), *pairs], left=range(4))
+        lines += ["", *_indented(table.splitlines())]
     lines += _section("Notes:", {value.name: value.note for value in known if value.note})
     lines += _section("No value yet:", missing)
     lines += _section("Not possible:", failed)
@@ -63,6 +74,23 @@ def row(value: Value) -> tuple[str, str, str, str]:
     time = "" if value.correlation_ps is None else f"{value.correlation_ps:.3g}"
     number = format_with_error(not_none(value.value), value.error)
     return value.name, number, unit, time
+
+
+def _pair(value: Value) -> str | None:
+    """The pair of sites of a value of g(r)."""
+    begin, _, title = value.name.partition(": ")
+    return begin.removeprefix("g ") if title in PEAK else None
+
+
+def _pairs(known: Sequence[Value]) -> list[list[str]]:
+    """Rows of g(r): pair, position and height of the first peak, neighbours, correlation time."""
+    cells: dict[str, dict[str, str]] = {}
+    for value in known:
+        if pair := _pair(value):
+            _, number, _, time = row(value)
+            title = value.name.partition(": ")[2]
+            cells.setdefault(pair, {TIME: time})[title] = number
+    return [[pair, *(of.get(title, "-") for title in (*PEAK, TIME))] for pair, of in cells.items()]
 
 
 def _section(title: str, reasons: Mapping[str, str]) -> list[str]:

@@ -673,6 +673,26 @@ def test_figures_are_of_the_requested_type(copy, capsys):
         }
 
 
+def test_a_pair_of_sites_has_one_row():
+    peaks = [("first peak", "Å", 2.75), ("height of that peak", "1", 3.1)]
+    values = [
+        Value(f"g {pair}: {title}", unit, x, 0.01, 0.4)
+        for pair in ("O-O", "O-H")
+        for title, unit, x in peaks
+    ]
+    values.insert(2, Value("g O-O: neighbours up to the first minimum", "1", 4.3, 0.1, 0.4))
+    values.append(Value("density", "g/cm³", 1.0, 0.001, 0.2))
+    text = "\n".join(results_text([AnalysisResult("test", "a test", values)], {}))
+    rows = [re.split("  +", line.strip()) for line in text.splitlines() if line]
+    assert rows == [
+        ["quantity", "value", "unit", "correlation time (ps)"],
+        ["density", "1.0000 ± 0.0010", "g/cm³", "0.2"],
+        ["g(r)", "first peak (Å)", "height", "neighbours", "correlation time (ps)"],
+        ["O-O", "2.750 ± 0.010", "3.100 ± 0.010", "4.30 ± 0.10", "0.4"],
+        ["O-H", "2.750 ± 0.010", "3.100 ± 0.010", "-", "0.4"],
+    ]
+
+
 def test_a_value_with_a_large_error_is_not_known_yet():
     values = [
         Value("firm", "1", 4.0, 2.0, None, ""),
