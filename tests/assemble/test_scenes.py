@@ -49,10 +49,10 @@ def test_when_total_momentum_is_taken_out():
         assert rigidmd.with_defaults(scene).run.remove_momentum_interval_ps == removed
     with pytest.raises(SceneError, match="total momentum is not conserved with frozen molecules"):
         small_scene({}, 25.0, molecules=frozen, run={"remove_momentum_interval_ps": 0.1})
-    text = describe(argon(run={"remove_momentum_interval_ps": 0.2}))
+    text = describe(argon(run={"remove_momentum_interval_ps": 0.2}), verbose=True)
     assert "total momentum: removed every 0.2 ps" in text
     assert "run.remove_momentum_interval_ps is false" in describe(
-        argon(run={"remove_momentum_interval_ps": False})
+        argon(run={"remove_momentum_interval_ps": False}), verbose=True
     )
 
 

@@ -4,7 +4,7 @@ import pytest
 from support.common import MOLECULES, small_scene
 from support.scenes import GOOD
 
-from rigidmd.assemble.time_step import step_warnings
+from rigidmd.assemble.time_step import step_errors, step_warnings
 from rigidmd.scene import Scene
 
 
@@ -16,7 +16,7 @@ from rigidmd.scene import Scene
         ("argon", 1.37, 94, 40, 150, "moves by 0.06"),
     ],
 )
-def test_check_warns_of_a_step_that_no_liquid_bears(
+def test_check_ends_with_an_error_for_a_step_that_no_liquid_bears(
     model, density, temperature, fine, too_long, words, printed, tmp_path
 ):
     """Longest stable steps of these liquids, by `stiffest_mode` after 3 ps: 10.7, 63 and 90 fs."""
@@ -28,11 +28,11 @@ def test_check_warns_of_a_step_that_no_liquid_bears(
         (tmp_path / "liquid.toml").write_text(
             text.replace("timestep_fs = 1", f"timestep_fs = {step}")
         )
-        warned = printed("check", tmp_path / "liquid.toml").err
+        warned = printed("check", tmp_path / "liquid.toml", code=int(long)).err
         assert bool(warned) == long
         if long:
             for part in (
-                f"stages.0: timestep_fs = {step} is too long for {model} at {temperature} K",
+                f"stages.0: timestep_fs = {step} is unstable for {model} at {temperature} K",
                 words,
             ):
                 assert part in warned
@@ -45,7 +45,7 @@ def test_a_step_is_long_for_what_moves_and_for_its_scheme():
             {"model": "spce", "count": 5, "frozen": more.pop("frozen", False)},
             {"model": "argon", "count": 5},
         ]
-        return step_warnings(small_scene({}, 20.0, molecules=molecules, stages=[stage], **more))
+        return step_errors(small_scene({}, 20.0, molecules=molecules, stages=[stage], **more))
 
     assert len(warned()) == 1
     assert not warned(frozen=True)
@@ -66,5 +66,6 @@ def test_a_step_is_long_for_what_moves_and_for_its_scheme():
 
 
 def test_no_shipped_scene_has_too_long_a_step():
-    warned = {path.stem: step_warnings(Scene.read(path)) for path in MOLECULES}
+    scenes = {path.stem: Scene.read(path) for path in MOLECULES}
+    warned = {name: step_warnings(scene) + step_errors(scene) for name, scene in scenes.items()}
     assert not any(warned.values()), warned
