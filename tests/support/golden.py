@@ -65,7 +65,7 @@ NOT_COMPARED = re.compile(
 #: Wall times and free memory in printed texts, and announcements of slow work.
 WALL_TIME = re.compile(
     r"(?m)[\d.,e+]+ steps/s(,? \(?[\d.,e+]+ ns/day\)?)?|(?<=; )[\d.,e+]+ s$|[\d.e+]+ GB free"
-    r"|^  .* \.\.\.\n"
+    r"|run time [\d.e+-]+ s, most of it output|^  .* \.\.\.\n"
 )
 FIGURES = {".png", ".svg", ".html"}
 SCENES = {

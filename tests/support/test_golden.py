@@ -83,5 +83,6 @@ def test_digests_have_values_and_no_wall_times(tmp_path, monkeypatch):
         "1 fs, 1,578 steps/s (124.8 ns/day)",
         "1 fs, 78 steps/s, 4.8 ns/day",
         "1 fs, 9 steps/s",
+        "1 fs, run time 0.69 s, most of it output",
     ):
         assert golden.WALL_TIME.sub("", text) == "1 fs, "

@@ -13,6 +13,9 @@ from rigidmd.features.bodies.system import BodySystem
 from rigidmd.run.failed_check import LARGE_ENERGY_ERROR
 from rigidmd.run.report import as_lines, last_lines, orthogonality, value_lines
 
+#: Fraction of the run time below which the time of the steps is not a speed.
+MOSTLY_OUTPUT = 0.5
+
 
 def summarise_body(
     system: BodySystem,
@@ -95,12 +98,14 @@ def summary_text(summary: dict, known: Container[str] = ()) -> str:
 
 
 def title_of(summary: dict) -> str:
-    """Steps and speed of a run of a single body."""
-    speed = f"; {summary['steps_per_s']:,.0f} steps/s" if summary["steps_per_s"] else ""
-    return (
-        f"{summary['steps']} steps of {summary['timestep_s']:g} s, {summary['duration_s']:g}"
-        f" s{speed}"
-    )
+    """Steps of a run of a single body, and its speed, or its run time if most of that is output."""
+    title = f"{summary['steps']} steps of {summary['timestep_s']:g} s, {summary['duration_s']:g} s"
+    if not summary["steps_per_s"]:
+        return title
+    running = summary["wall_s"] - summary["preparing_s"]
+    if summary["computing_s"] < MOSTLY_OUTPUT * running:
+        return f"{title}; run time {running:.2g} s, most of it output"
+    return f"{title}; {summary['steps_per_s']:,.0f} steps/s"
 
 
 #: Name of a rate of a body -> its name in reports, and how it is written with a number.

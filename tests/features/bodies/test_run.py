@@ -16,6 +16,7 @@ import rigidmd
 from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError, SimulationError, StructureError
 from rigidmd.features.bodies.assemble import build_body
+from rigidmd.features.bodies.summary import title_of
 from rigidmd.features.view.figures.picture import Picture
 from rigidmd.io.scene_file import write_scene
 from rigidmd.run import Every, Simulation
@@ -564,3 +565,12 @@ def test_a_body_begins_only_from_states_that_it_can_have():
     with simulation, pytest.raises(RuntimeError, match="the run has begun"):
         simulation.step(1)
         simulation.start_from(simulation.state)
+
+
+@pytest.mark.parametrize(
+    ("computing", "speed"), [(0.7, "; 143 steps/s"), (0.2, "; run time 1 s, most of it output")]
+)
+def test_a_run_that_mostly_writes_has_no_speed(computing, speed):
+    times = {"wall_s": 1.5, "preparing_s": 0.5, "computing_s": computing}
+    summary = {"steps": 100, "timestep_s": 0.01, "duration_s": 1.0, "steps_per_s": 100 / computing}
+    assert title_of(summary | times) == f"100 steps of 0.01 s, 1 s{speed}"
