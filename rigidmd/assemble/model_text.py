@@ -3,7 +3,7 @@
 import re
 from collections import Counter
 from itertools import combinations
-from textwrap import shorten, wrap
+from textwrap import wrap
 
 import numpy as np
 
@@ -12,20 +12,21 @@ from rigidmd.scene.models import GROUPS, Molecule
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 WIDTH = 100
+MOST_CHARGES = 3  # in a line of the table
 
 
 def models_table(molecules: list[Molecule]) -> str:
     """A line for each model, by groups, at most WIDTH columns wide."""
     groups = []
     for group in GROUPS:
-        lines = [f"{group:<20}sites   mass u dipole D  {'charges, e':<22}source"]
+        lines = [f"{group:<20}sites   mass u dipole D  {'charges, e':<24}source"]
         for m in [m for m in molecules if m.group == group]:
             dipole = f"{m.dipole_debye:.3f}" if m.charges.any() and m.radius > 0 else ""
-            charges = " ".join(dict.fromkeys(f"{q:+.4g}" for q in m.charges if q))
+            charges = [*dict.fromkeys(f"{q:<+8.4g}" for q in m.charges if q)]
+            if len(charges) > MOST_CHARGES:
+                charges[MOST_CHARGES - 1 :] = ["..."]
             line = f"  {m.name:<19}{len(m.masses):>4}{m.mass:>9.4g}{dipole:>9}  "
-            lines.append(
-                f"{line}{shorten(charges, 21, placeholder=' ...'):<22}{short_source(m)}".rstrip()
-            )
+            lines.append(f"{line}{''.join(charges):<24}{short_source(m)}".rstrip())
         if len(lines) > 1:
             groups.append("\n".join(lines))
     return "\n\n".join(groups)

@@ -3,6 +3,8 @@
 from rigidmd.commands.arguments import Options, command
 from rigidmd.features import FEATURES
 
+NUMBER = 6  # width of the column of numbers of molecules
+
 
 @command(
     "Start", 20, "list the scenes, notebooks and scripts that rigidmd ships", "rigidmd examples"
@@ -22,9 +24,11 @@ def _examples(options: Options) -> int:
     }
     width = max(len(example.name) for example in scenes)
     for title, shipped in kinds.items():
-        print(f"{title}:")
+        has_size = any(example.molecules for example in shipped)
+        print(f"{title}:{'number':>{width + NUMBER + 3 - len(title)}}" if has_size else f"{title}:")
         for example in shipped:
-            print(f"  {example.name:<{width}}  {example.about}")
+            number = f"{example.molecules or '':>{NUMBER}}  " if has_size else ""
+            print(f"  {example.name:<{width}}  {number}{example.about}")
         print()
     print("`rigidmd new NAME` copies one into the working directory, `rigidmd run NAME.toml` runs")
     print("it, and `rigidmd view runs/NAME` shows it in a browser")

@@ -81,6 +81,7 @@ class Example(NamedTuple):
     path: Path
     about: str  # the first line of its comment, or of its text
     tables: tuple[str, ...] = ()  # of a scene
+    molecules: int | None = None  # of a scene that gives all counts
 
     @property
     def kind(self) -> str:
@@ -93,15 +94,27 @@ def examples(files: str = "*.toml") -> list[Example]:
     shipped = []
     for path in SYSTEMS.glob(files):
         text = path.read_text(encoding="utf-8")
-        tables = tuple(tomllib.loads(text)) if path.suffix == ".toml" else ()
+        tables = tomllib.loads(text) if path.suffix == ".toml" else {}
         first = "".join(json.loads(text)["cells"][0]["source"]) if path.suffix == ".ipynb" else text
         shipped.append(
-            Example(path.stem, path, first.partition("\n")[0].removeprefix("# "), tables)
+            Example(
+                path.stem,
+                path,
+                first.partition("\n")[0].removeprefix("# "),
+                tuple(tables),
+                _count_of(tables.get("molecules", [])),
+            )
         )
     return sorted(
         shipped,
         key=lambda one: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", one.name)],
     )
+
+
+def _count_of(molecules: list[dict]) -> int | None:
+    """The number of molecules of a scene, if its [[molecules]] have it."""
+    counts = [entry.get("count") for entry in molecules]
+    return sum(counts) if counts and None not in counts else None
 
 
 def find_example(name: str) -> Example:

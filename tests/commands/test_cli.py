@@ -173,6 +173,18 @@ def test_an_unknown_integrator_of_the_command(printed, tmp_path):
     )
 
 
+def test_numbers_of_models_are_under_their_headers(printed):
+    lines = printed("models").out.splitlines()
+    header = next(line for line in lines if line.startswith("water "))
+    places = [header.index("charges, e"), header.index("source")]
+    for name in ("spce", "acetonitrile_opls", "so2"):
+        line = next(line for line in lines if line.startswith(f"  {name} "))
+        assert len(line) <= 100
+        charges = line[places[0] : places[1]]
+        assert all(charges[k] in "+-. " for k in (0, 8, 16)) and charges[:2].strip()
+        assert line[places[1] - 1] == " " and line[places[1]].isupper()
+
+
 def test_the_command_and_the_scene_suggest_the_same_model(capsys, printed, tmp_path):
     scene = refused(capsys, tmp_path, GOOD.replace("spce", "SPC-EE"))
     command = printed("models", "SPC-EE", code=2).err

@@ -60,6 +60,11 @@ def test_examples_are_listed_by_kind_with_their_first_line(printed):
         assert f"  {path.stem} " in own
         assert about in own
     assert (bodies + molecules).count("\n  ") == len(SYSTEMS)
+    header, *rows = molecules.rstrip().splitlines()
+    numbers = {row.split()[0]: row[: len(header)].split()[1:] for row in rows}
+    assert header.endswith(" number")
+    assert numbers["water_nitrogen"] == ["220"]
+    assert numbers["dry_ice"] == []  # its molecules come from a structure file
 
 
 @pytest.mark.parametrize("path", SYSTEMS, ids=lambda path: path.stem)
