@@ -3,6 +3,7 @@
 import time
 
 from rigidmd.commands.arguments import SCENE, Options, argument, command, read_scene
+from rigidmd.commands.streams import shown_working
 
 #: What is compiled without a scene: a liquid with PME, as a first run needs it.
 FIRST_SCENE = "water"
@@ -32,7 +33,7 @@ def _compile(options: Options) -> int:
     scene = read_scene(options)
     announced: list[bool] = []
     began = time.perf_counter()
-    with compiling_announced(lambda: announced.append(True)):
+    with compiling_announced(lambda: announced.append(True)), shown_working("compiling"):
         Simulation(scene).compile()
     if announced:
         print(f"{scene.name}: compiled in {time.perf_counter() - began:.0f} s; {describe_cache()}")

@@ -3,6 +3,7 @@
 import json
 
 from rigidmd.commands.arguments import SCENE, Options, argument, command, flag, read_scene
+from rigidmd.commands.streams import shown_working
 
 
 @command(
@@ -31,9 +32,10 @@ def _energy(options: Options) -> int:
     if options.unit is not None:
         kind.check_has(scene, "--unit", unit=options.unit)
     unit = options.unit or kind.energy_unit
-    energies = Simulation(scene)._start_energy(
-        ENERGY_UNITS.get(unit, 1.0), unit, measure_accuracy=options.accuracy
-    )
+    with shown_working("computing energies and forces"):
+        energies = Simulation(scene)._start_energy(
+            ENERGY_UNITS.get(unit, 1.0), unit, measure_accuracy=options.accuracy
+        )
     if options.json:
         print(json.dumps(energies, indent=2))
     else:

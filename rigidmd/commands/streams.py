@@ -6,9 +6,12 @@ import io
 import os
 import sys
 from collections.abc import Callable, Iterator
-from typing import TextIO, cast
+from typing import TYPE_CHECKING, TextIO, cast
 
 from rigidmd.errors import OutputError, visible
+
+if TYPE_CHECKING:
+    from tqdm import tqdm
 
 
 def announce(message: str) -> None:
@@ -17,8 +20,14 @@ def announce(message: str) -> None:
 
 
 def warn(message: str) -> None:
-    """Print a warning on the standard error."""
-    print(f"rigidmd: warning: {visible(message)}", file=sys.stderr)
+    """Print a warning on the standard error, in a line without a bar."""
+    bars_hidden = contextlib.nullcontext()
+    if "tqdm" in sys.modules:
+        from tqdm import tqdm
+
+        bars_hidden = tqdm.external_write_mode(sys.stderr)
+    with bars_hidden:
+        print(f"rigidmd: warning: {visible(message)}", file=sys.stderr)
 
 
 @contextlib.contextmanager
@@ -28,19 +37,8 @@ def progress_bar(begins: str = "") -> Iterator[Callable]:
 
     begins : what starts at the fraction 0, when all arguments have been checked
     """
-    from tqdm import tqdm
-
-    from rigidmd.io.progress import ROWS, columns
-
-    form = "{l_bar}{bar}| [{elapsed}<{remaining}]"  # the left part has the description
-    options = {
-        "disable": None,
-        "leave": False,
-        "bar_format": form,
-        "ncols": columns(),
-        "nrows": ROWS,
-    }
-    with tqdm(total=1.0, **options) as bar:
+    # the left part has the description
+    with _terminal_bar("{l_bar}{bar}| [{elapsed}<{remaining}]") as bar:
 
         def progress(fraction: float, description: str = "") -> None:
             if begins and fraction == 0:
@@ -50,6 +48,30 @@ def progress_bar(begins: str = "") -> Iterator[Callable]:
             bar.update(fraction - bar.n)
 
         yield progress
+
+
+@contextlib.contextmanager
+def shown_working(message: str) -> Iterator[None]:
+    """Within it, a terminal shows what takes a while, in a line that disappears."""
+    with _terminal_bar("  {desc} ...", message):
+        yield
+
+
+def _terminal_bar(form: str, description: str | None = None) -> "tqdm":
+    """A bar on a terminal, which disappears at its end. Elsewhere nothing is shown."""
+    from tqdm import tqdm
+
+    from rigidmd.io.progress import ROWS, columns
+
+    return tqdm(
+        total=1.0,
+        desc=description,
+        disable=None,
+        leave=False,
+        bar_format=form,
+        ncols=columns(),
+        nrows=ROWS,
+    )
 
 
 def open_streams() -> None:

@@ -113,8 +113,8 @@ def examples(files: str = "*.toml") -> list[Example]:
 
 def _count_of(molecules: list[dict]) -> int | None:
     """The number of molecules of a scene, if its [[molecules]] have it."""
-    counts = [entry.get("count") for entry in molecules]
-    return sum(counts) if counts and None not in counts else None
+    counts = [entry["count"] for entry in molecules if "count" in entry]
+    return sum(counts) if len(counts) == len(molecules) > 0 else None
 
 
 def find_example(name: str) -> Example:

@@ -1,11 +1,21 @@
 """Progress of a run on a terminal, in a notebook and elsewhere; lines of the log."""
 
+import contextlib
+import fcntl
+import io
+import os
+import pty
+import struct
+import subprocess
 import sys
+import termios
 
 import numba
 import pytest
 from support.common import ROOT, small_scene
+from support.processes import process
 
+from rigidmd.commands.streams import shown_working, warn
 from rigidmd.compile.cache import CacheIndex
 from rigidmd.io import progress, run_files
 from rigidmd.run import Every, Simulation, molecular
@@ -142,3 +152,45 @@ def test_every_bar_has_the_rate_of_what_it_has_seen(monkeypatch, capsys, kind):
     else:
         assert "74 %: 74 of 100 ps, 00:40, 04:20 left" in shown
         assert shown[-2:] == ["86 %: 86 of 100 ps, 02:40, 02:20 left", "86 %: 86 of 100 ps, 02:40"]
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_command_shows_that_it_works_on_a_terminal(terminal):
+    """Also on one that has no size. The line is cleared before the command ends."""
+    command = [
+        sys.executable,
+        "-m",
+        "rigidmd",
+        "energy",
+        str(ROOT / "systems" / "water_dimer.toml"),
+    ]
+    if not terminal:
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        assert done.stderr == ""
+        return
+    leader, follower = pty.openpty()
+    fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", 0, 0, 0, 0))
+    with process(command, stdout=subprocess.PIPE, stderr=follower) as energy:
+        os.close(follower)
+        shown = b""
+        with contextlib.suppress(OSError):  # at the end of a terminal
+            while part := os.read(leader, 1000):
+                shown += part
+        os.close(leader)
+        assert b"potential" in energy.stdout.read()
+        assert energy.wait() == 0
+    assert b"computing energies and forces ..." in shown
+    assert not shown.decode().rstrip("\r").rpartition("\r")[2].strip()
+
+
+def test_a_warning_is_not_on_the_line_of_a_bar(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    with shown_working("comparing"):
+        warn("too long")
+        shown = sys.stderr.getvalue()
+    assert shown.startswith("\r  comparing ...\r")
+    assert "\rrigidmd: warning: too long\n\r  comparing ..." in shown

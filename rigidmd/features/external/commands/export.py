@@ -4,6 +4,7 @@ import shlex
 from pathlib import Path
 
 from rigidmd.commands.arguments import SCENE, Options, command, output_folder, read_scene
+from rigidmd.commands.streams import shown_working
 from rigidmd.core.programs import programs
 
 
@@ -27,7 +28,8 @@ def _export(options: Options) -> int:
 
     scene = read_scene(options)
     folder = Path(options.output or f"{scene.name}-{options.to}")
-    done = export(scene, options.to, folder, options.force)
+    with shown_working(f"exporting to {options.to}"):
+        done = export(scene, options.to, folder, options.force)
     print(f"{scene.name} for {done.title} in {folder}: {', '.join(done.files)}")
     for note in done.notes:
         print(f"  {note}")

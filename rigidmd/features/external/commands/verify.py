@@ -5,6 +5,7 @@ import json
 
 from rigidmd.commands import FAILED
 from rigidmd.commands.arguments import SCENE, Options, add_engine, command, flag, read_scene
+from rigidmd.commands.streams import shown_working
 from rigidmd.core.programs import runnable
 
 
@@ -39,6 +40,7 @@ def _verify(options: Options) -> int:
         for key, value in runnable()[options.engine].precise.items():
             setattr(options, key, getattr(options, key) or value)
         scene = read_scene(options)
-    comparison = verify(scene)
+    with shown_working("comparing with another engine"):
+        comparison = verify(scene)
     print(json.dumps(comparison.to_json(), indent=2) if options.json else comparison.description())
     return 0 if comparison.agrees else FAILED

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from rigidmd.commands import FAILED
 from rigidmd.commands.arguments import Options, argument, command, flag
+from rigidmd.commands.streams import shown_working
 
 
 @command(
@@ -20,7 +21,8 @@ from rigidmd.commands.arguments import Options, argument, command, flag
 def _compare(options: Options) -> int:
     from rigidmd.features.studies.compare import compare, describe_run_comparison
 
-    comparison = compare(Path(options.first), Path(options.second))
+    with shown_working("comparing"):
+        comparison = compare(Path(options.first), Path(options.second))
     print(
         json.dumps(comparison.to_json(), indent=2)
         if options.json
