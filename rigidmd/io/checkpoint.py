@@ -15,8 +15,8 @@ from rigidmd.errors import CheckpointError, option
 from rigidmd.io.folder import CHECKPOINT, PREVIOUS
 
 #: Version of the format. Version 1 (rigidmd 0.1) named observers by their number; 2 had no record
-#: of the run; 3 had other names.
-SCHEMA = 6
+#: of the run; 3 had other names, 6 other columns.
+SCHEMA = 7
 #: Members besides the arrays of the run: all other values as JSON, and names, lengths and CRC-32 of
 #: all other members.
 JSON, CONTENTS = "values", "contents"

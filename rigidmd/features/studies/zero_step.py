@@ -108,7 +108,9 @@ def _add_curves(result: AnalysisResult, run: RigidFrames, axis: str | None) -> N
     largest = 0.5 * float(min(heights(cell).min() for cell in frames.cell))
     functions = [lambda one: _unchecked(rdf)(one, largest=min(LARGEST, largest))]
     if axis:
-        functions.append(lambda one: _unchecked(density_profile)(one, axis=axis))
+        (profile,) = _unchecked(density_profile)(Runs((frames,)), axis=axis).curves
+        bins = len(profile.axis[1])  # of a single frame the density always changes
+        functions.append(lambda one: _unchecked(density_profile)(one, axis=axis, bins=bins))
     indices = np.flatnonzero(known)
     for function in functions:
         single = [function(Runs((frames[k : k + 1],))).curves[0] for k in indices]

@@ -130,7 +130,7 @@ def test_an_undetected_error_beyond_the_step_limit_is_a_failure():
     assert limit.beyond == UNDETECTED
     result = TrialResult(CASE, Trial("once", is_bisected=True), "pefrl", Outcome(), limit)
     assert result.failure.startswith("made_up, once pefrl, steps beyond 0.9")
-    assert conclusions([result])[0].startswith("failed: 1 cases, 0 runs")
+    assert conclusions([result])[0].startswith("failed: 0 of 0 runs in 1 case")
 
 
 def test_rows_have_the_keys_of_their_layers():
@@ -206,7 +206,7 @@ def liar(monkeypatch):
 def test_an_undetected_error_is_exit_code_1(tmp_path, capsys, liar):
     assert main(["stability", "--case", "liar", "-o", str(tmp_path / "out")]) == 1
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("failed: 1 cases, 1 runs: 1 undetected;")
+    assert lines[0].startswith("failed: 0 of 1 runs in 1 case; 1 undetected;")
     assert lines[0].endswith("; 1 warnings, which -v lists")
     assert lines[1] == "liar, always pefrl: undetected"
 

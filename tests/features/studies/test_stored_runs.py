@@ -203,7 +203,7 @@ def test_a_sweep_is_read(tmp_path):
 
 
 def test_what_is_not_a_run(tmp_path, run):
-    with pytest.raises(OutputError, match="is not there"):
+    with pytest.raises(OutputError, match="does not exist"):
         rigidmd.read_run(tmp_path / "nothing")
     with pytest.raises(OutputError, match="is not the folder of a run"):
         rigidmd.read_run(tmp_path)

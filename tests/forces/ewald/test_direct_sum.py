@@ -373,7 +373,7 @@ duration_ps = 0.004
         ["run", "-o", str(tmp_path / "out")],
     ):
         assert main([arguments[0], scene, *arguments[1:]]) == 0
-        out = capsys.readouterr().out
+        out = " ".join(capsys.readouterr().out.split())  # lines of check are wrapped
         assert told in (out if "--json" not in arguments else "".join(json.loads(out)["notes"]))
     assert told in (tmp_path / "out" / "summary.json").read_text()
 

@@ -171,7 +171,7 @@ def test_a_file_of_one_point_that_changes_is_noticed(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("of_sweep", [["--extrapolate", "stages.0.timestep_fs"], ["pmf"]])
 def test_a_sweep_that_is_not_there_is_not_a_run(of_sweep, printed, tmp_path):
-    assert "none is not there" in printed("analyse", tmp_path / "none", *of_sweep, code=2).err
+    assert "none' does not exist" in printed("analyse", tmp_path / "none", *of_sweep, code=2).err
 
 
 def test_analyses_of_a_sweep_continue_without_a_damaged_point(copied, printed, monkeypatch):
