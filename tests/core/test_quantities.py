@@ -41,12 +41,12 @@ def test_one_row_adds_a_quantity_everywhere(tmp_path, monkeypatch):
     (stage,) = json.loads((folder / "summary.json").read_text())["stages"]
     assert stage["translation_kJ_mol"] == pytest.approx(results["kinetic"].mean())
     assert stage["translation_error_kJ_mol"] > 0
-    mean = rf"{stage['translation_kJ_mol']:.1f}\d* ± [\d.]+"
+    mean = rf"{stage['translation_kJ_mol']:.1f}\d*\s±\s[\d.]+"
     for text_of in (summary_text, short_summary):
         assert re.search(rf"\n  translation +{mean} +kJ/mol", text_of(results.summary))
     write_report(folder, tmp_path / "page.html")
-    page = re.sub("<[^>]*>", "|", (tmp_path / "page.html").read_text())
-    assert re.search(rf"translation\| kJ/mol[|]+{mean}\|", page)
+    page = re.sub("<[^>]*>", "|", (tmp_path / "page.html").read_text("utf-8"))
+    assert re.search(rf"translation\|\s*kJ/mol[|]+{mean}\|", page)
     means = summarise_run(read_record(folder))
     table = Table(tmp_path, [], [SweepRow({}, {None: means})], list(means))
     assert row.header in table.main_columns()
