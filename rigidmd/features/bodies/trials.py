@@ -119,7 +119,8 @@ def _systems_of_methods(
         except SceneError as error:
             # without advice
             reasons = (
-                re.split(r"[:.] [Uu]se ", text.removeprefix("run: "))[0] for text in error.errors
+                re.split(r"[:.] [Uu]se ", re.sub(r"^(line \d+: )?run: ", "", text))[0]
+                for text in error.errors
             )
             refused[name] = "; ".join(reasons).replace(solver, "it")
     if not fits:
