@@ -89,6 +89,9 @@ class Page:
         write_files(before, self.folder)
         for words in new_scenes(before):
             self.run(words)
+        for part in before:  # snippets that write tables
+            if part.language == "python" and not part.about and "rigidmd" not in part.text:
+                subprocess.run([sys.executable, "-c", part.text], cwd=self.folder, check=True)
         runs = [
             self.run([*words, *(self.options_of(words) if quoted.kind == "of" else [])])
             for words in quoted.commands
