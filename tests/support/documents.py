@@ -13,8 +13,8 @@ A comment before a block names what it is:
     <!-- test: output of CMD -->   every line of the block is in the output of CMD, in this order.
                                    CMD runs with the options of the document where it is one of its
                                    commands, else as it stands
-    <!-- test: output like CMD | WHERE -->  the same, but each number may be any number, with any
-                                   spaces before it, and a line may be longer: the block is of a
+    <!-- test: output like CMD | WHERE -->  the same, but each number may be any number, with more
+                                   or fewer spaces before it, and a line may be longer: the block is of a
                                    longer run, or of another version of another program
     <!-- output: CMD && CMD | WHERE -->  the block is recorded: it quotes the output of the last CMD,
                                    in full length. Tests compare what a scene determines
@@ -99,7 +99,7 @@ def pattern_of(quoted: str, like: bool) -> re.Pattern:
         if part == "...":
             return ".*"
         if like and part.isspace():
-            return r"\s*"
+            return r"\s+"
         if re.fullmatch(ROUNDING, part) and not like:
             return f"(?:{ROUNDING})"
         return NUMBER if like and re.fullmatch(NUMBER, part) else re.escape(part)
