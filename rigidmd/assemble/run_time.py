@@ -3,12 +3,12 @@
 On other processors, and for small systems, it is right to a factor of about two.
 """
 
-from math import inf, pi, prod
+from math import inf, isfinite, pi, prod
+
+import numpy as np
 
 from rigidmd.compile.machine import usable_threads
 from rigidmd.engines.system import System
-from rigidmd.forces.ewald.direct_sum import EwaldSum
-from rigidmd.forces.ewald.pme import Pme
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.scene.stage import Stage
 
@@ -27,7 +27,10 @@ def expected_seconds(system: System) -> float | None:
     scene, stages = system.scene, system.scene.stages
     if scene.engine.is_external or system.user_terms or any(stage.is_auto for stage in stages):
         return None
-    pairs = sum(_pairs(system, term) for term in system.terms.values())
+    pairs = sum(
+        _k_space(term) if name.endswith("reciprocal") else _pairs(system, term)
+        for name, term in system.terms.items()
+    )
     step = PAIR_NS[system.precision] * pairs + MOLECULE_NS * len(system.model.species)
     threads = usable_threads(scene.threads) ** THREADS_EXPONENT
     return START_S + 1e-9 * step / threads * sum(map(_evaluations, stages))
@@ -44,8 +47,23 @@ def _pairs(system: System, term: object) -> float:
     if isinstance(term, PairForces):
         sites = len(term.group)
         reach = getattr(term.potential, "cutoff", inf) + system.scene.forces.skin_A
-        near = 4 / 3 * pi * reach**3 / system.space.volume if reach < inf else 1.0
+        near = 4 / 3 * pi * reach**3 / _volume(system, reach) if reach < inf else 1.0
         return sites**2 / 2 * min(1.0, near)
+    return 0.0
+
+
+def _volume(system: System, reach: float) -> float:
+    """The volume of the box, or that in which molecules without a box are within reach."""
+    if isfinite(system.space.volume):
+        return system.space.volume
+    return float(np.prod(np.ptp(system.state.position, axis=0) + reach))
+
+
+def _k_space(term: object) -> float:
+    """The cost of sums in reciprocal space, in pairs. Loaded here, as few scenes need them."""
+    from rigidmd.forces.ewald.direct_sum import EwaldSum
+    from rigidmd.forces.ewald.pme import Pme
+
     if isinstance(term, Pme):  # as in `forces.ewald.errors`
         return len(term.charge) * (20 + 2.4 * term.order**2) + 8 * prod(term.grid)
     if isinstance(term, EwaldSum):

@@ -46,8 +46,8 @@ def _check(options: Options) -> int:
         _print_more(options, cast("System", system))
     for warning in (*system.warnings, *kind.step_warnings(system)):
         warn(warning)
-    for error in (errors := kind.step_errors(system)):
-        print(f"rigidmd: error: {SceneError(scene.source, [error])}", file=sys.stderr)
+    if errors := kind.step_errors(system):
+        print(f"rigidmd: error: {SceneError(scene.source, errors)}", file=sys.stderr)
     return FAILED if errors else 0
 
 

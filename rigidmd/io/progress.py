@@ -2,10 +2,10 @@
 
 import html
 import io
+import os
 import sys
 import threading
 import time as clock
-from shutil import get_terminal_size
 from typing import TYPE_CHECKING, TextIO, TypedDict, Unpack
 
 from tqdm import tqdm
@@ -96,7 +96,11 @@ ROWS = 24  # of a terminal, which limits how many bars it shows
 
 def columns() -> int:
     """The width of a bar. A terminal that does not have its size counts as one of 80 columns."""
-    return get_terminal_size((80, 24)).columns - 1
+    try:
+        width = os.get_terminal_size(sys.stderr.fileno()).columns
+    except (OSError, ValueError):
+        width = 0
+    return (width or 80) - 1
 
 
 class Bar(tqdm):

@@ -220,16 +220,24 @@ class Observer:
         return ""
 
 
+def _is_former(value: object) -> bool:
+    """Whether an observer has the method `see` of the version before, and not `observe`: as an
+    attribute, or in the first class that has one of them."""
+    spaces = [getattr(value, "__dict__", {}), *map(vars, type(value).__mro__)]
+    nearest = next((space for space in spaces if {"observe", "see"} & space.keys()), {})
+    return "observe" not in nearest and callable(nearest.get("see"))
+
+
 def as_observer(value: object) -> Observer:
     """An observer, or one that calls an object with `observe` and `interval` (or `steps`, `ends`),
     which may also have any of the other methods and attributes of `Observer` but `remembers`.
     Raises TypeError."""
     method = getattr(value, "observe", None)
-    if getattr(type(value), "see", Observer.see) is not Observer.see:
+    if _is_former(value):
         warn_renamed(f"{type(value).__name__}.see", "observe")
         method = value.see  # pyright: ignore[reportAttributeAccessIssue]
         if isinstance(value, Observer):
-            value.observe = method
+            object.__setattr__(value, "observe", method)
     if isinstance(value, Observer):
         return value
     is_timed = any(hasattr(value, name) for name in ("interval", "steps", "ends"))

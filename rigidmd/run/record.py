@@ -1,6 +1,7 @@
 """Reading of the folder of a run: its scene, its summary, and its samples."""
 
 import shlex
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
@@ -10,7 +11,7 @@ import numpy as np
 from rigidmd.core.quantities import energy_of_force
 from rigidmd.core.toml import Json
 from rigidmd.engines import samples
-from rigidmd.errors import OutputError
+from rigidmd.errors import OutputError, RigidMDWarning
 from rigidmd.io.folder import SCENE, SUMMARY, check_is_run
 from rigidmd.io.run_files import Summary, read_json
 from rigidmd.run.kind import kind_of
@@ -78,7 +79,9 @@ def read_record(folder: Path) -> Record:
     """Read the folder of a run, ended or not. Raises OutputError if it is no such folder, or has no
     samples."""
     check_is_run(folder)
-    scene = Scene.read(folder / SCENE)
+    with warnings.catch_warnings():  # the scene of a run of the version before has former names
+        warnings.filterwarnings("ignore", "the key .* is", RigidMDWarning)
+        scene = Scene.read(folder / SCENE)
     summary = read_json(folder / SUMMARY, Summary)
     missing = []
     resume = f"`rigidmd resume {shlex.quote(str(folder))}` continues it"

@@ -25,6 +25,7 @@ from rigidmd.errors import CheckpointError, SceneError, option
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import elsewhere
 from rigidmd.scene import Scene, is_molecular
+from rigidmd.scene.validation import FORMER_KEYS
 
 #: Packages that may change the last bits of a result.
 PACKAGES = ("rigidmd", "numba", "llvmlite", "numpy", "scipy", "rocket_fft")
@@ -154,7 +155,7 @@ def _flat(data: object, name: str = "") -> Json:
     return {
         key: value
         for part, inner in data.items()
-        for key, value in _flat(inner, f"{start}{part}").items()
+        for key, value in _flat(inner, f"{start}{FORMER_KEYS.get(part, part)}").items()
     }
 
 

@@ -24,6 +24,8 @@ TABLES = {
 #: `scene.kinds`.
 KINDS: list[Callable[[], list]] = []
 MOST_LISTED = 8  # known keys in a message
+#: Names of the strength of gravity.
+GRAVITY = ("g", "acceleration", "gravity", "strength", "value")
 BOHR = 0.529177210903  # Å
 CELSIUS = ("C", "degC", "celsius")
 ICE_POINT = 273.15
@@ -76,7 +78,7 @@ def hint_on_key(name: str, keys: list, value: object, model: type[BaseModel]) ->
     is_start = any(re.fullmatch(f"{re.escape(name)}_[a-zA-Z0-9_]+", key) for key in known)
     if converted := _other_unit(name, value, known):
         return converted
-    if known == ["acceleration_m_s2"] and isinstance(value, int | float):
+    if bare in GRAVITY and known == ["acceleration_m_s2"] and isinstance(value, int | float):
         return f"; write acceleration_m_s2 = [0, 0, {-abs(value):.12g}]"
     if longer := _with_its_words(name, known):
         return suggestion(longer)

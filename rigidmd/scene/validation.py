@@ -234,11 +234,13 @@ class SceneText(Source):
 
 
 def _is_meant(missing: tuple, errors: dict[tuple, list[str]]) -> bool:
-    """Whether the message on an unknown key of the same table names a missing one."""
+    """Whether the message on an unknown key of the same table suggests a missing one."""
     key = str(missing[-1]) if missing else ""
     name = re.compile(rf"\b{re.escape(key)}\b")
     return any(
-        keys[:-1] == missing[:-1] and sentence.startswith(UNKNOWN) and name.search(sentence)
+        keys[:-1] == missing[:-1]
+        and sentence.startswith(UNKNOWN)
+        and name.search(sentence.partition("; there ")[0])
         for keys, sentences in errors.items()
         for sentence in sentences
     )

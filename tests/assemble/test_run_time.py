@@ -28,6 +28,18 @@ def test_it_grows_with_steps_evaluations_precision_and_molecules():
     assert 6 < seconds(**eight_times) / base < 10
 
 
+def test_molecules_without_a_box_cost_their_pairs():
+    """A droplet has about the pairs of a box of its size, not none."""
+    data = {"molecules": [{"model": "argon", "count": 500}], "start": {"temperature_K": 90.0}}
+    stages = {"stages": [{"duration_ps": 1000.0, "timestep_fs": 5.0}], "threads": 1}
+    stages["forces"] = {"cutoff_A": 9.0}
+    droplet, box = (
+        expected_seconds(build(Scene.from_dict(data | stages | {"box": each}))) - START_S
+        for each in ({"lengths_A": 30.0, "periodic": False}, {"lengths_A": 30.0})
+    )
+    assert 0.3 < droplet / box < 1.5
+
+
 def test_it_is_not_given_where_it_is_not_known():
     scene = Scene.read(ROOT / "systems" / "gay_berne.toml")
     system = build(scene)

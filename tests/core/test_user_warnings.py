@@ -1,6 +1,8 @@
 """Warnings to users, `core/user_warnings.py`: names of the version before work with a warning that
 names the new one."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from support.common import small_scene
@@ -8,6 +10,7 @@ from support.common import small_scene
 import rigidmd
 from rigidmd import FORMER_NAMES, Scene, Simulation
 from rigidmd.errors import RigidMDWarning, SceneError
+from rigidmd.run.observers import as_observer
 
 STAGES = [{"ensemble": "minimise", "most_iterations": 3}, {"duration_ps": 0.02}]
 
@@ -47,6 +50,17 @@ def test_observers_with_the_former_method_are_called():
             seen.append("before")
             super().see(moment)
 
+    class Both:
+        interval = 0.01
+
+        def observe(self, moment):
+            pass
+
+        def see(self, moment):
+            raise AssertionError
+
+    assert as_observer(SimpleNamespace(interval=0.01, observe=print)).interval == 0.01
+    assert as_observer(Both()).interval == 0.01
     observers = [Plain(), Derived(0.01, lambda moment: seen.append(moment.step))]
     with (
         pytest.warns(DeprecationWarning, match="Plain.see is observe now"),

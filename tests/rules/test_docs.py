@@ -26,6 +26,7 @@ from support.documents import (
     README,
     Block,
     blocks_of,
+    changed,
     commands_of,
     new_scenes,
     output_of,
@@ -71,19 +72,6 @@ MINIMAL = {
         "run": {"duration_s": 1.0, "timestep_s": 0.01},
     },
 }
-
-
-def changed(arguments: list[str], options: list[str]) -> list[str]:
-    """Arguments with further options. Those of --set replace values of the same keys."""
-    new = {word.partition("=")[0] for word in options}
-    pairs = list(zip(arguments, [*arguments[1:], ""], strict=True))
-    old = [
-        k
-        for k, (word, value) in enumerate(pairs)
-        if word == "--set" and value.partition("=")[0] in new
-    ]
-    left = [word for k, word in enumerate(arguments) if k not in old and k - 1 not in old]
-    return [*left, *options]
 
 
 class Reader:
@@ -260,9 +248,7 @@ def test_what_a_document_describes_can_be_done(
         assert {_first_of_its_kind(column) for column in header} <= named
 
 
-DURATION_AND_STEP = re.compile(
-    r"([\d.,]+) ps at ([\d.]+) fs|([\d,]+) steps of ([\d.]+) (?:fs|s)\\b"
-)
+DURATION_AND_STEP = re.compile(r"([\d.,]+) ps at ([\d.]+) fs|([\d,]+) steps of ([\d.]+) (?:fs|s)\b")
 
 
 def quoted_segments(text: str) -> set[tuple[float, float]]:

@@ -485,7 +485,7 @@ def test_a_body_whose_energy_goes_wrong(tmp_path, printed):
     assert "Try timestep_s below 0.085, where its spin and swing are stable" in said
     assert "The motion so far" in said
     assert len((tmp_path / "out" / "motion.csv").read_text().splitlines()) > 200
-    assert warnings[0].startswith("timestep_s = 0.2 is unstable")
+    assert warnings[0].startswith("run: timestep_s = 0.2 is unstable")
     sets = [
         part
         for key, value in wrong.items()

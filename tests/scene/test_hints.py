@@ -25,6 +25,17 @@ def hint_on(name, table, section):
     return found
 
 
+def test_the_strength_of_gravity_becomes_a_vector():
+    assert hint_on("g", "", "gravity").endswith("write acceleration_m_s2 = [0, 0, -1]")
+    assert "write" not in hint_on("seed", "", "gravity")
+
+
+def test_a_list_of_known_keys_does_not_hide_that_some_are_missing():
+    with pytest.raises(SceneError) as raised:
+        Scene.from_dict({"body": {"mass_kg": 1.0, "inertia_kg_m2": [1, 1, 1]}, "run": {"zzz": 1}})
+    assert raised.value.errors[:2] == ["run.duration_s: is missing", "run.timestep_s: is missing"]
+
+
 def test_a_setting_of_another_program_names_the_key_of_a_scene():
     wrong = []
     entries = [(table, *item) for table in FOREIGN for item in FOREIGN[table].items()]

@@ -88,7 +88,7 @@ def commands_of(text: str) -> list[list[str]]:
     ]
 
 
-NUMBER = r"[+-]?\d[\d,.]*(?:e[+-]?\d+)?"
+NUMBER = r"(?<![\w.])[+-]?\d[\d,.]*(?:e[+-]?\d+)?"
 ROUNDING = r"\d(?:\.\d+)?e-[1-9]\d|0\.0e\+00"
 
 
@@ -105,7 +105,20 @@ def pattern_of(quoted: str, like: bool) -> re.Pattern:
         return NUMBER if like and re.fullmatch(NUMBER, part) else re.escape(part)
 
     parts = re.split(rf"(\.\.\.|\s+|{ROUNDING}|{NUMBER})", quoted)
-    return re.compile("".join(map(form, parts)) + (".*" if like else r"\s*"))
+    return re.compile("".join(map(form, parts)) + (r"(?:\s.*)?" if like else r"\s*"))
+
+
+def changed(arguments: list[str], options: list[str]) -> list[str]:
+    """Arguments with further options. Those of --set replace values of the same keys."""
+    new = {word.partition("=")[0] for word in options}
+    pairs = list(zip(arguments, [*arguments[1:], ""], strict=True))
+    old = [
+        k
+        for k, (word, value) in enumerate(pairs)
+        if word == "--set" and value.partition("=")[0] in new
+    ]
+    left = [word for k, word in enumerate(arguments) if k not in old and k - 1 not in old]
+    return [*left, *options]
 
 
 class Output(NamedTuple):

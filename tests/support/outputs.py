@@ -26,6 +26,7 @@ from support.documents import (
     Block,
     Output,
     blocks_of,
+    changed,
     commands_of,
     new_scenes,
     output_of,
@@ -76,12 +77,12 @@ class Page:
             self.printed[line] = done.stdout, time.perf_counter() - start
         return self.printed[line]
 
-    def options_of(self, words: list[str]) -> list[str]:
-        """What the comment before the block of a command adds to it."""
+    def shortened(self, words: list[str]) -> list[str]:
+        """A command as the comment before its block shortens it."""
         for block in self.blocks:
             if block.language == "sh" and words in commands_of(block.text):
-                return shlex.split(block.about.removeprefix("with ")) if "--" in block.about else []
-        return []
+                return changed(words, shlex.split(block.about.partition("with ")[2]))
+        return words
 
     def output(self, block: Block, quoted: Output) -> tuple[str, float]:
         """The output that a block quotes, and the time that its commands took."""
@@ -93,7 +94,7 @@ class Page:
             if part.language == "python" and not part.about and "rigidmd" not in part.text:
                 subprocess.run([sys.executable, "-c", part.text], cwd=self.folder, check=True)
         runs = [
-            self.run([*words, *(self.options_of(words) if quoted.kind == "of" else [])])
+            self.run(self.shortened(words) if quoted.kind == "of" else words)
             for words in quoted.commands
         ]
         return runs[-1][0], sum(seconds for _, seconds in runs)
@@ -122,11 +123,12 @@ def renewed(quoted: str, printed: str) -> tuple[str, list[str]]:
     for line in quoted.splitlines():
         pattern = pattern_of(line, like=True)
         here = next((k for k in range(at, len(lines)) if pattern.fullmatch(lines[k])), None)
-        if line.strip() in ("", "...") or ("..." in line and here is not None):
+        if line.strip() in ("", "..."):
             new.append(line)
-        elif here is None:
+        elif here is None or "..." in line:
             new.append(line)
-            missing.append(line)
+            if here is None or not pattern_of(line, like=False).fullmatch(lines[here]):
+                missing.append(line)
         else:
             new.append(lines[here])
             at = here + 1

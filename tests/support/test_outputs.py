@@ -58,3 +58,11 @@ def test_a_block_of_a_page_is_rewritten_with_where_it_was_made(tmp_path):
     assert block.text == "a: one body, asymmetric, 1 kg, 6 degrees of freedom"
     assert "0.1 at" not in output_of(block).where
     assert Page(path, tmp_path / "again").rewrite(block, output_of(block)) == []
+
+
+def test_digits_in_names_and_longer_words_are_not_numbers():
+    printed = "srkn_4  2.0\n  temperature of a wall  3\n9999 steps of 0.1 s; fast\nsrkn_6  3.5\n"
+    quoted = "srkn_6  2.0\n3400 steps of 0.0005 s; ..."
+    assert renewed("srkn_6  2.0", printed) == ("srkn_6  3.5", [])
+    assert renewed("  temp", printed)[1] == ["  temp"]
+    assert renewed(quoted.splitlines()[1], printed)[1] == ["3400 steps of 0.0005 s; ..."]

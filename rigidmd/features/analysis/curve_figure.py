@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from itertools import cycle
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -52,7 +53,10 @@ def curves_figure(curves: "Sequence[Curve]", title: str) -> "Picture":
 
 def _draw(axis: "Axes", curve: "Curve") -> None:
     header, x = curve.axis
-    shown = [title for title in curve.columns if not NEIGHBOURS.fullmatch(title)][:MOST_CURVES]
+    neighbours = [title for title in curve.columns if NEIGHBOURS.fullmatch(title)]
+    if len(neighbours) == len(curve.columns):
+        neighbours = []
+    shown = [title for title in curve.columns if title not in neighbours][:MOST_CURVES]
     is_drawn = x > 0 if curve.log[0] else np.ones(len(x), bool)
     if curve.level is not None:
         axis.axhline(curve.level, color=FAINT, lw=0.7)
@@ -72,8 +76,8 @@ def _draw(axis: "Axes", curve: "Curve") -> None:
     axis.set_ylabel(curve.label, fontsize=TITLE, color=INK)
     open_axis(axis, labelsize=TEXT)
     if heights.size:
-        _set_range(axis, curve, heights)
-    if neighbours := [title for title in curve.columns if NEIGHBOURS.fullmatch(title)]:
+        _set_range(axis, curve, shown, heights)
+    if neighbours:
         _draw_neighbours(axis, curve, shown, neighbours[:MOST_CURVES])
     if curve.power is not None:
         _draw_power(axis, curve.power, x[is_drawn], heights)
@@ -101,14 +105,14 @@ def _draw_column(
         axis.fill_between(x[is_drawn], low, high, color=color, alpha=0.25, lw=0)
 
 
-def _set_range(axis: "Axes", curve: "Curve", heights: np.ndarray) -> None:
+def _set_range(axis: "Axes", curve: "Curve", shown: "Sequence[str]", heights: np.ndarray) -> None:
     """Set the range of y to the values and the bands of their later half: errors of the first
     values of a running mean are large. Some start at 0."""
     if not curve.log[1] and not curve.bars:
         late = slice(heights.shape[1] // 2, None)
         ends = [heights.min(), heights.max()]
         for title, error in curve.errors.items():
-            if title in curve.columns and np.isfinite(error).all():
+            if title in shown and np.isfinite(error).all():
                 late_values = curve.columns[title][late]
                 ends += [(late_values - error[late]).min(), (late_values + error[late]).max()]
         if curve.level is not None:
@@ -126,7 +130,7 @@ def _draw_neighbours(
     """Draw the running coordination numbers on an axis on the right, in the colours of g(r)."""
     right, x = axis.twinx(), curve.axis[1]
     within = []
-    for color, pair, title in zip(COLORS, shown, neighbours, strict=False):
+    for color, pair, title in zip(cycle(COLORS), shown, neighbours, strict=False):
         right.plot(x, curve.columns[title], color=color, lw=0.9, ls=(0, DASHES[1]))
         within.append(curve.columns[title][curve.columns[pair].argmax()])
     right.set_ylim(0.0, MOST_NEIGHBOURS * max(within) or 1.0)
@@ -134,7 +138,8 @@ def _draw_neighbours(
     right.spines[["top", "left"]].set_visible(False)
     right.spines["right"].set_color(INK)
     right.tick_params(colors=INK, labelsize=TEXT)
-    axis.set_ylim(bottom=0.0)
+    if all(curve.columns[title].min() >= 0 for title in shown):
+        axis.set_ylim(bottom=0.0)
 
 
 def _draw_power(axis: "Axes", power: float, x: np.ndarray, heights: np.ndarray) -> None:

@@ -40,7 +40,11 @@ def results_text(
         if verbose or not value.name.startswith(DETAILS)
     ]
     known = [value for value in values if is_known(value)]
-    missing = {value.name: value.note or uncertain(value) for value in values if value not in known}
+    missing = {
+        value.name: value.note if value.value is None else uncertain(value)
+        for value in values
+        if value not in known
+    }
     lines = []
     pairs = _pairs(known)
     if others := [value for value in known if _pair(value) is None]:
@@ -64,8 +68,8 @@ def is_known(value: Value) -> bool:
 
 def uncertain(value: Value) -> str:
     """Why a value with an error is not known."""
-    number = format_with_error(not_none(value.value), value.error)
-    return f"{number} {value.unit} is too uncertain"
+    _, number, unit, _ = row(value)
+    return f"{number} {unit}".rstrip() + " is too uncertain"
 
 
 def row(value: Value) -> tuple[str, str, str, str]:

@@ -23,8 +23,9 @@ def step_errors(system: BodySystem) -> list[str]:
     if longest is None or run.timestep_s <= longest:
         return []
     return [
-        f"timestep_s = {run.timestep_s:g} is unstable: {_moves(system)}, which {run.integrator} can"
-        f" follow up to {longest:.3g} s. Use {round_steps(longest)[0]:g} s or less"
+        f"run: timestep_s = {run.timestep_s:g} is unstable: {_moves(system)}, which"
+        f" {run.integrator} can follow up to {longest:.3g} s. Use"
+        f" {round_steps(longest)[0]:g} s or less"
     ]
 
 
@@ -37,8 +38,8 @@ def step_warnings(system: BodySystem) -> list[str]:
     if error <= INACCURATE:
         return []
     return [
-        f"timestep_s = {run.timestep_s:g} is inaccurate: {_moves(system)}, which {run.integrator}"
-        f" follows as if its torques were wrong by {error:.0%}"
+        f"run: timestep_s = {run.timestep_s:g} is inaccurate: {_moves(system)}, which"
+        f" {run.integrator} follows as if its torques were wrong by {error:.0%}"
     ]
 
 

@@ -165,10 +165,11 @@ class MoleculeAnimation(Animation):
         return colors * (1 - haze) + haze
 
     def _begin_of_last_stage(self) -> float:
-        """The time of the first frame of the last stage."""
+        """The time of the first frame of the last stage, or of all if no frame follows it."""
         columns = self._record.columns
         last = columns["time"][columns["stage"] == columns["stage"][-1]]
-        return float(self.time[min(np.searchsorted(self.time, last[0]), len(self.time) - 1)])
+        k = int(np.searchsorted(self.time, last[0]))
+        return float(self.time[k if k < len(self.time) - 1 else 0])
 
     def page_part(self) -> PagePart:
         """The animation by chemiscope. Raises OutputError."""

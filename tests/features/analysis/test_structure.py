@@ -116,6 +116,16 @@ def test_the_profile_of_a_density_is_where_the_mass_is():
     assert found["z (A)"][[0, -1]] == pytest.approx([0.25, 24.75])
 
 
+def test_a_uniform_density_has_few_bins_and_a_slab_many():
+    system = system_of({"argon": 64}, 25.0)
+    rng = np.random.default_rng(3)
+    for height, bins in ((25.0, 20), (10.0, 100)):
+        positions = rng.uniform(0, 25.0, (10, 64, 3))
+        positions[..., 2] *= height / 25.0
+        found = density_profile(history(system, np.arange(10.0), positions, np.eye(3) * 25.0), "z")
+        assert len(found["z (A)"]) == bins
+
+
 def test_hydrogen_bonds_are_those_of_the_geometry():
     """A bond that points at its neighbour through the wall; one that is 25° off, and one that is
     35° off."""

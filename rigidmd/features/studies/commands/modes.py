@@ -156,8 +156,9 @@ def _describe(modes: "NormalModes") -> Iterator[str]:
             f" {mode}"
         )
     zero = [k for k in table.rows if modes.rate[k] == 0]
-    if len(zero) > 1:
-        yield f"  zero: modes {zero[0] + 1} to {zero[-1] + 1}"
+    if zero:
+        last_zero = f"s {zero[0] + 1} to {zero[-1] + 1}" if len(zero) > 1 else f" {zero[0] + 1}"
+        yield f"  zero: mode{last_zero}"
     moving = [k for k in table.rows if k not in zero]
     shown = [*moving[:ROWS], *[k for k in moving[ROWS:] if k > last - ROWS]]
     yield "\n" + table._replace(rows=shown).text()
