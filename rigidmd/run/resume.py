@@ -155,7 +155,7 @@ def _flat(data: object, name: str = "") -> Json:
     return {
         key: value
         for part, inner in data.items()
-        for key, value in _flat(inner, f"{start}{FORMER_KEYS.get(part, part)}").items()
+        for key, value in _flat(inner, f"{start}{FORMER_KEYS.get(str(part), part)}").items()
     }
 
 

@@ -407,7 +407,7 @@ def density_profile(runs: Runs, axis: Axis = "z", bins: Count | None = None) -> 
     if bins is None:
         density = runs.mean([profile_of_all(runs.kinds, FEW_BINS, run) for run in runs.members])
         # the mean over a quarter of the edge: few frames of few molecules scatter
-        smooth = sum(np.roll(density, k) for k in range(FEW_BINS // 4)) / (FEW_BINS // 4)
+        smooth = np.mean([np.roll(density, k) for k in range(FEW_BINS // 4)], axis=0)
         is_uniform = smooth.min() > LEAST_DENSITY * density.mean()
         bins = FEW_BINS if is_uniform else MANY_BINS
     at = (np.arange(bins) + 0.5) * height / bins
