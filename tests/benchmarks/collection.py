@@ -124,6 +124,9 @@ def measure(name: str, docs: Path) -> None:
     from rigidmd.features.studies.accuracy import accuracy
     from rigidmd.scene import Scene, parse_override
 
+    sys.path.insert(0, str(ROOT / "tests"))
+    from support.common import processor
+
     _, file, settings = SCENES[name]
     if SMOKE and "top" not in file:
         settings = (*settings, *SMOKE_SETTINGS)
@@ -138,14 +141,9 @@ def measure(name: str, docs: Path) -> None:
         reached[f"{target:.0e}"] = {
             n: [p.time, p.step, p.spread] for n, p in points.items() if p is not None
         }
-    processor = next(
-        line
-        for line in Path("/proc/cpuinfo").read_text().splitlines()
-        if line.startswith("model name")
-    )
     facts = {
         "date": str(date.today()),
-        "processor": processor.partition(": ")[2],
+        "processor": processor(),
         "python": python_version(),
         "versions": {
             package: version(package) for package in ("rigidmd", "numba", "numpy", "scipy")

@@ -32,7 +32,6 @@ the velocities of half a step before.
 import hashlib
 import json
 import os
-import platform
 import re
 import shlex
 import subprocess
@@ -55,7 +54,7 @@ from scipy.spatial import cKDTree
 from scipy.special import erfc
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from support.common import observe
+from support.common import observe, processor
 
 from rigidmd import Scene, Simulation
 from rigidmd.assemble.build import build
@@ -888,17 +887,6 @@ def caption(rows: list[dict], found: dict) -> str:
     )
 
 
-def machine() -> str:
-    """The processor, as text."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(
-            line.partition(":")[2].strip() for line in lines if line.startswith("model name")
-        )
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
-
-
 def arguments():
     """The command line."""
     parser = new_parser(__doc__)
@@ -994,7 +982,7 @@ def main() -> None:
     bench = Bench(asked.workloads, curves, asked.tries, asked.patience, cpus, starts)
     about = {
         "command": shlex.join(["python", "tests/benchmarks/peers.py", *sys.argv[1:]]),
-        "machine": machine(),
+        "machine": processor(),
         "date": datetime.now(UTC).date().isoformat(),
         "versions": versions,
         "workloads": {name: WORKLOADS[name].title for name in asked.workloads},

@@ -263,6 +263,11 @@ def quoted_segments(text: str) -> set[tuple[float, float]]:
     }
 
 
+def test_numbers_of_steps_in_outputs_are_found():
+    text = "NVT, 10 ps at 4 fs, 3 steps/s\n3,400 steps of 0.0005 s, 1.7 s\n0: 2500 steps of 4 fs = 10 ps"
+    assert quoted_segments(text) == {(2500, 4.0), (3400, 0.0005)}
+
+
 def segments_of(scene: Scene) -> set[tuple[float, float]]:
     """The same of a scene."""
     if isinstance(scene, BodyScene):
@@ -679,16 +684,16 @@ def test_the_page_of_models_has_the_tables_of_their_files():
     assert PAGES["models"].read_text(encoding="utf-8").endswith("\n" + models_tables())
 
 
+def test_the_section_of_the_collection_is_written_from_its_data(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "tests" / "benchmarks")
+    import collection
+
+    assert PAGES["accuracy_cost"].read_text(encoding="utf-8") == collection.page_text()
+
+
 if __name__ == "__main__":
     text = PAGES["models"].read_text(encoding="utf-8")
     PAGES["models"].write_text(text[: text.index("## Water")] + models_tables(), encoding="utf-8")
     PAGES["contents"].write_text(contents_text(), encoding="utf-8")
     text = PAGES["body"].read_text(encoding="utf-8").partition("## Shipped bodies")[0]
     PAGES["body"].write_text(text + bodies_table(), encoding="utf-8")
-
-
-def test_the_section_of_the_collection_is_written_from_its_data(monkeypatch):
-    monkeypatch.syspath_prepend(ROOT / "tests" / "benchmarks")
-    import collection
-
-    assert PAGES["accuracy_cost"].read_text(encoding="utf-8") == collection.page_text()

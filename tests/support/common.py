@@ -1,5 +1,6 @@
 """Helpers that several test files use. What a test tests it imports from its module."""
 
+import platform
 import shlex
 import shutil
 import subprocess
@@ -235,3 +236,14 @@ def refusal(capsys, tmp_path, text, *arguments, commands=("check",)):
         messages.add(capsys.readouterr().err)
     assert len(messages) == 1
     return messages.pop()
+
+
+def processor() -> str:
+    """The name of the processor."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next(
+            line.partition(":")[2].strip() for line in lines if line.startswith("model name")
+        )
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()

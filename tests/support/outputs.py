@@ -10,6 +10,7 @@ what changed, and the lines that are not in the new output, which a person must 
 """
 
 import argparse
+import os
 import re
 import shlex
 import shutil
@@ -20,7 +21,7 @@ import time
 from pathlib import Path
 
 import rigidmd
-from support.common import ROOT
+from support.common import ROOT, processor
 from support.documents import (
     DOCUMENTS,
     Block,
@@ -40,9 +41,6 @@ SECONDS = re.compile(r", (\d+) s$")
 
 def machine() -> str:
     """Version and processor, as a block names them."""
-    lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    name = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    cores = sum(line.startswith("processor") for line in lines)
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"],
         cwd=ROOT,
@@ -50,7 +48,7 @@ def machine() -> str:
         text=True,
         check=True,
     ).stdout.strip()
-    return f"rigidmd {rigidmd.__version__} at {commit}, {cores} cores of an {name}"
+    return f"rigidmd {rigidmd.__version__} at {commit}, {os.cpu_count()} cores of an {processor()}"
 
 
 class Page:
