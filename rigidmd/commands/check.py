@@ -101,8 +101,5 @@ def _print_profile(scene: "MolecularScene") -> None:
     system, stage = simulation.system, simulation.scene.stages[stages[0]]
     scheme = integrator_of_stage(system, stages[0])
     profile = profile_of(system.engine(), state, scheme, stage.step)
-    print(
-        f"\ntime of a step of stages.{stages[0]} ({stage.label}) and of its rows,"
-        f" {simulation.threads} threads:"
-    )
+    print(f"\ntime of a step of stages.{stages[0]} ({stage.label}) and of its rows:")
     print(describe_profile(profile))

@@ -20,6 +20,7 @@ from rigidmd.compile.kernels import chosen_by_type, implements, is_a, kernel
 from rigidmd.compile.machine import BLOCKS, MOST_BLOCKS, SIMD_BITS
 from rigidmd.compile.program import (
     ALWAYS,
+    JOINED,
     Pass,
     Program,
     Rows,

@@ -1,10 +1,10 @@
 """Programs: tables of passes, which one runner executes.
 
-A pass is the address of a task, the address of its arguments, the number of its blocks, and bits
-for when it
-acts. Python makes the table from what a scene has. The runner is compiled once for everything: it
-calls row after row, and stops where a pass sets a status. The types of the arguments choose the
-code of a pass, and nothing above it.
+A pass is the address of a task, the address of its arguments, the number of its blocks, bits for
+when it acts, and the job to which it belongs. Python makes the table from what a scene has.
+The runner is compiled once for everything: it calls row after row, those of one job together, and
+stops where a pass sets a status. The types of the arguments choose the code of a pass, and nothing
+above it.
 """
 
 from collections.abc import Sequence
@@ -14,11 +14,27 @@ import numpy as np
 
 from rigidmd.compile.code import CompiledTask, addresses_of, arguments_type
 from rigidmd.compile.kernels import kernel
+from rigidmd.compile.machine import MOST_BLOCKS
 from rigidmd.compile.records import NumbaStruct
-from rigidmd.compile.thread_pool import call_address, run_on_all_threads
+from rigidmd.compile.stopwatch import measure_block
+from rigidmd.compile.thread_pool import (
+    AFTER,
+    AT_ONCE,
+    COLUMNS,
+    MOST_ROWS,
+    WITH,
+    call_address,
+    run_job,
+    run_on_all_threads,
+)
 
 #: Acts whenever the program runs.
 ALWAYS = -1
+#: The job of a pass that runs when all before it are done, and which the next one waits for. Only
+#: such a pass may call blocks of other tasks on all threads.
+ALONE = 0
+#: The chain of passes with the same blocks, each of which follows the same block of the one before.
+JOINED = -1
 
 
 class Pass(NamedTuple):
@@ -29,6 +45,13 @@ class Pass(NamedTuple):
     content: tuple  # its arguments
     blocks: int = 1
     when: int = ALWAYS  # bits
+    # neighbouring passes with the same number are one job, in which chains run at the same time
+    job: int = ALONE
+    chain: int = 0
+
+    def in_job(self, job: int, chain: int) -> "Pass":
+        """The pass in a job and a chain."""
+        return self._replace(job=job, chain=chain)
 
 
 class Rows(NamedTuple):
@@ -39,6 +62,9 @@ class Rows(NamedTuple):
     arguments: np.ndarray  # (rows,) intp, of the arguments
     blocks: np.ndarray  # (rows,)
     when: np.ndarray  # (rows,) bits
+    job: np.ndarray  # (rows,)
+    chain: np.ndarray  # (rows,)
+    table: np.ndarray  # (rows, COLUMNS) memory for the table of a job
     status: np.ndarray  # (1,) 0 while all is well
 
 
@@ -58,8 +84,13 @@ class Program:
             [(one.task, kind) for one, kind in zip(used, self._kinds, strict=True)]
         )
         when = np.array([one.when for one in used], np.intp)
-        self.rows = Rows(addresses, np.zeros_like(when), np.ones_like(when), when, status)
-        self._bound: dict[int, list[NumbaStruct]] = {}
+        arguments, blocks, job, chain = np.zeros((4, len(used)), np.intp)
+        table = np.zeros((len(used), COLUMNS), np.intp)
+        self.rows = Rows(addresses, arguments, blocks, when, job, chain, table, status)
+        # arrays of addresses, with the arguments to which they belong
+        self._bound: dict[int, tuple[np.ndarray, list[NumbaStruct]]] = {}
+        self._spent: np.ndarray | None = None
+        self._unmeasured, self._watches = addresses, dict[int, list[NumbaStruct]]()
 
     def bind(self, passes: Sequence[Pass], arguments: np.ndarray | None = None) -> None:
         """Set the arguments of all passes, in `rows` or in another array of addresses (rows,).
@@ -73,9 +104,32 @@ class Program:
             if (other := arguments_type(one.content)) is not kind and other != kind:
                 name = one.task.name[1]
                 raise TypeError(f"{name} was compiled for {kind}, not for {other}")
-        target[:] = [struct.address for struct in structs]
         self.rows.blocks[:] = [one.blocks for one in used]
-        self._bound[id(target)] = structs
+        self.rows.job[:] = [one.job for one in used]
+        self.rows.chain[:] = [one.chain for one in used]
+        self._set_arguments(target, structs)
+
+    def _set_arguments(self, target: np.ndarray, structs: list[NumbaStruct]) -> None:
+        self._bound[id(target)] = target, structs
+        if self._spent is not None:
+            rows = zip(self._unmeasured.tolist(), structs, self._spent, strict=True)
+            structs = [NumbaStruct((task, struct.address, spent)) for task, struct, spent in rows]
+            self._watches[id(target)] = structs
+        target[:] = [struct.address for struct in structs]
+
+    def measure(self) -> np.ndarray:
+        """Measure all blocks from now on. Returns the array (rows, blocks, 8) to whose [..., 0]
+        their times are added, ns; threads write to different cache lines."""
+        count = len(self.rows.when)
+        self._spent, self._unmeasured = (
+            np.zeros((count, MOST_BLOCKS, 8), int),
+            self.rows.address.copy(),
+        )
+        kind = arguments_type((0, 0, np.zeros((MOST_BLOCKS, 8), int)))
+        self.rows.address[:] = addresses_of([(measure_block, kind)])
+        for target, structs in list(self._bound.values()):
+            self._set_arguments(target, structs)
+        return self._spent
 
     def _used(self, passes: Sequence[Pass]) -> list[Pass]:
         return [one for one in passes if one.when & self._uses]
@@ -107,7 +161,7 @@ def run_from(rows, when, row):
 
 @kernel(inline=True)
 def call_row(rows, arguments, k):
-    """Call pass k; its status is in `rows`."""
+    """Call pass k by itself; its status is in `rows`."""
     if rows.blocks[k] == 1:
         call_address(rows.address[k], arguments[k], 0)
     else:
@@ -119,10 +173,33 @@ def run_passes(rows, arguments, when):
     """Call the passes that act at `when`, bits; returns the first status that is not 0, or 0.
     arguments : their addresses, of `rows` or others"""
     rows.status[0] = 0
+    count = 0  # of rows in the table of the next job
+    job, chain = ALONE, 0  # of the last one
     for k in range(len(rows.address)):
         if rows.when[k] & when == 0:
             continue
-        call_row(rows, arguments, k)
+        if rows.job[k] != job or count == MOST_ROWS:
+            count = _run_collected(rows, count)
+        if rows.job[k] == ALONE and rows.status[0] == 0:
+            call_row(rows, arguments, k)
+        elif rows.job[k] != ALONE:
+            row = rows.table[count]
+            row[0], row[1], row[2] = rows.address[k], arguments[k], rows.blocks[k]
+            row[3] = AT_ONCE
+            if count > 0 and rows.chain[k] == chain:
+                has_same_blocks = row[2] == rows.table[count - 1, 2]
+                row[3] = WITH if chain == JOINED and has_same_blocks else AFTER
+            count += 1
         if rows.status[0] != 0:
-            break
+            return rows.status[0]
+        job, chain = rows.job[k], rows.chain[k]
+    _run_collected(rows, count)
     return rows.status[0]
+
+
+@kernel
+def _run_collected(rows, count):
+    """Run the first rows of the table of a job. Returns the number of rows in the next table: 0."""
+    if count > 0:
+        run_job(rows.table.ctypes.data, count, rows.status.ctypes.data)
+    return 0

@@ -1,14 +1,19 @@
-"""A pool of threads that run the blocks of a task, without OpenMP: one per core, waiting inside
+"""A pool of threads that run the blocks of a job, without OpenMP: one per core, waiting inside
 compiled code.
 
+A job is a table of rows: a task, its arguments and the number of its blocks. A row may wait until
+the row before it is done, as forces on a grid wait for the grid, or begin at once. So blocks of one
+chain of rows fill the time in which another chain has none left, and threads wait at the end of a
+job, not of a row.
+
 The calling thread is in the loop over steps. The worker threads are Python threads that never leave
-`_run_worker` and do not hold Python's lock. The calling thread publishes a task, its arguments and
-the number of blocks, and runs blocks itself. Workers that are awake run blocks too, until none is
-left. Each thread begins with its own work range, which is the same in every task, so that data that
-it has computed are still in the cache of its core; then it continues with ranges that other threads
-have not begun. The calling thread does not wait for workers that have begun no range, for example
-because their core is busy with another program. So a task costs a few transfers of a cache line
-between cores, not the start of a parallel region and a barrier of all threads at its end.
+`_run_worker` and do not hold Python's lock. The calling thread publishes a job and runs blocks
+itself. Workers that are awake run blocks too, until none is left. In each row a thread begins with
+its own work range, which is the same in every job, so that data that it has computed are still in
+the cache of its core; then it continues with ranges that other threads have not begun. The calling
+thread does not wait for workers that have begun no range, for example because their core is busy
+with another program. So a job costs a few transfers of a cache line between cores, not the start of
+a parallel region and a barrier of all threads at its end.
 
 If the pool is busy, with another calling thread or because a block itself has blocks, the calling
 thread runs all its blocks alone. The blocks of a task, not the threads, determine the bits of a
@@ -33,42 +38,41 @@ import llvmlite.binding
 import numpy as np
 from llvmlite import ir
 from numba import types
+from numba.core import cgutils
 from numba.extending import intrinsic
 
 from rigidmd.compile.kernels import compile_callback, compiler_options, kernel
 from rigidmd.compile.machine import IS_X86, MOST_BLOCKS, MOST_THREADS, POINTER, function_at
 
 INT64 = ir.IntType(64)
+#: When a row of a job begins: at once; when the row before it is done; or each of its blocks right
+#: after the same block of the row before it, on the same thread.
+AT_ONCE, AFTER, WITH = range(3)
+#: Columns of the table of a job: addresses of the task and of its arguments, number of blocks, one
+#: of the above.
+ADDRESS, ARGUMENTS, BLOCKS, BEGINS = range(4)
+COLUMNS = 4
+MOST_ROWS = 64  # of a job
+MOST_RANGES = MOST_BLOCKS  # of a row; if there are more blocks, a work range has several
+
 # Indices of 64-bit cells in the memory of the pool. A cache line has 8; different threads write to
 # different lines.
-# address of `_run_task`; workers in use; polls of a waiting thread before it sleeps
-RUN_TASK, WORKERS, POLLS = (
-    0,
-    1,
-    2,
-)
-BUSY = 8  # 1 while a calling thread uses the pool
-JOB = 16  # even number of the present job; odd while a job is being written
-# the job: address of its task, address of its arguments, number of blocks
-ADDRESS, ARGUMENTS, BLOCKS = (
-    24,
-    25,
-    26,
-)
-DONE = 32  # number of its ranges that are finished
-# 1 while the calling thread sleeps; the lock on which it sleeps
-CALLER_SLEEPS, CALLER_LOCK = (
-    40,
-    41,
-)
-RANGE_JOBS = 48  # for each work range, the last job in which a thread began it
-MOST_RANGES = MOST_BLOCKS  # if there are more blocks, a work range has several
-# a cache line for each worker: 1 while it sleeps, and its lock
-FIRST_WORKER, LINE = (
-    RANGE_JOBS + MOST_RANGES,
-    8,
-)
-SLEEPS, LOCK = 0, 1
+LINE = 8
+# address of `_run_job`; threads in use; polls of a waiting thread before it sleeps; always 0
+RUN_JOB, THREADS, POLLS, ZERO = range(4)
+BUSY = LINE  # 1 while a calling thread uses the pool
+JOB = 2 * LINE  # even number of the present job; odd while a job is being written
+ROWS, STATUS = 3 * LINE, 3 * LINE + 1  # of the job: number of rows, address of its status
+EVENTS = 4 * LINE  # grows with each new job and each row that is done
+ROWS_DONE = 5 * LINE
+# of each row, after its columns: ranges that are left; the last job in which it was done; for each
+# range, the last job in which a thread began it
+FIRST_ROW = 6 * LINE
+LEFT, DONE, BEGUN = LINE, 2 * LINE, 3 * LINE
+ROW = BEGUN + MOST_RANGES
+# of each thread, the calling one first: 1 while it sleeps; the lock on which it sleeps
+FIRST_THREAD = FIRST_ROW + MOST_ROWS * ROW
+SLEEPS, LOCK = range(2)
 SYMBOL = "rigidmd_thread_pool"
 ALLOCATE, ACQUIRE, RELEASE = (
     "PyThread_allocate_lock",
@@ -76,7 +80,7 @@ ALLOCATE, ACQUIRE, RELEASE = (
     "PyThread_release_lock",
 )
 #: Time in seconds for which a waiting thread polls before it sleeps: longer than the time between
-#: two tasks, and too short to disturb other programs.
+#: two jobs, and too short to disturb other programs.
 POLLING_TIME = 50e-6
 
 
@@ -174,96 +178,197 @@ def call_address(typing, address, task_arguments, block):
 
 
 @kernel(count_references=False)
-def _run_ranges(pool, job, address, task_arguments, blocks, thread, threads):
-    """Run the ranges of a job that no thread has begun; returns whether the last one to finish was
-    among them.
+def _call_blocks_of_rows(table, columns, k, rows, status, first, end):
+    """Call blocks first ... end - 1 of row k of a table, each with the same block of the rows
+    `WITH` it, while the status is 0."""
+    for block in range(first, end):
+        n = k
+        while n == k or (n < rows and _read(table, n * columns + BEGINS) == WITH):
+            if _read(status, 0) == 0:
+                row = n * columns
+                call_address(_read(table, row + ADDRESS), _read(table, row + ARGUMENTS), block)
+            n += 1
+
+
+@kernel(count_references=False)
+def _begin_range(pool, job, row, ranges, at, step):
+    """Begin a range of a row that no thread has begun, the first one from number `at` on in steps
+    of 1 or -1; returns its number, or -1 if there is none."""
+    for _ in range(ranges):
+        begun = _read(pool, row + BEGUN + at)
+        # A range of an earlier job has this number or a later one: all were begun before the next
+        # job was written.
+        if begun < job and _replace(pool, row + BEGUN + at, begun, job):
+            return at
+        at = (at + step + ranges) % ranges
+    return -1
+
+
+@kernel(count_references=False)
+def _run_ranges_of_row(pool, job, k, rows, thread, threads):
+    """Run ranges of a row until none is left, or there are new events: rows before it may have
+    become ready. Returns their number, and whether ranges may be left.
 
     Even threads begin with their first range and go up, odd ones with their last and go down: two
     neighbouring threads meet where they have computed the same data.
     """
+    row = FIRST_ROW + k * ROW
+    events, blocks = _read(pool, EVENTS), _read(pool, row + BLOCKS)
     ranges = min(blocks, MOST_RANGES)
-    last = False
-    up = thread % 2 == 0
-    at = thread * ranges // threads if up else max(0, (thread + 1) * ranges // threads - 1)
-    for _ in range(ranges):
-        begun = _read(pool, RANGE_JOBS + at)
-        # A range of an earlier job has this number or a later one: all were begun before the next
-        # job was written.
-        if begun < job and _replace(pool, RANGE_JOBS + at, begun, job):
-            for block in range(at * blocks // ranges, (at + 1) * blocks // ranges):
-                call_address(address, task_arguments, block)
-            last |= _add(pool, DONE, 1) + 1 == ranges
-        at = (at + (1 if up else ranges - 1)) % ranges
-    return last
-
-
-def _run_worker(pool, index):
-    """Loop of worker thread `index`; never returns."""
-    line = FIRST_WORKER + LINE * index
-    polls = finished = 0
+    step = 1 - 2 * (thread % 2)
+    at = thread * ranges // threads
+    if step < 0:
+        at = max(0, (thread + 1) * ranges // threads - 1)
+    # what was read belongs to this job if its number is still the same
+    if _read(pool, JOB) != job:
+        return 0, True
+    count = 0
     while True:
-        job, workers = _read(pool, JOB), _read(pool, WORKERS)
-        address, task_arguments, blocks = (
-            _read(pool, ADDRESS),
-            _read(pool, ARGUMENTS),
-            _read(pool, BLOCKS),
-        )
-        # these values belong to this job if its number is still the same
-        if job != finished and job % 2 == 0 and index < workers and _read(pool, JOB) == job:
-            if _run_ranges(
-                pool, job, address, task_arguments, blocks, index + 1, workers + 1
-            ) and _replace(pool, CALLER_SLEEPS, 1, 0):
-                _wake(_read(pool, CALLER_LOCK))
-            finished = job
-            polls = 0
-        elif polls < _read(pool, POLLS):
+        at = _begin_range(pool, job, row, ranges, at, step)
+        if at < 0:
+            return count, False
+        low, high = at * blocks // ranges, (at + 1) * blocks // ranges
+        table = pool + 8 * FIRST_ROW
+        _call_blocks_of_rows(table, ROW, k, rows, _read(pool, STATUS), low, high)
+        count += 1
+        if _read(pool, EVENTS) != events:
+            return count, True
+
+
+@kernel(count_references=False)
+def _run_ranges(pool, thread):
+    """Run ranges of the present job, those of its first rows first, until none can begin. Returns
+    whether any was run."""
+    job, rows, threads = _read(pool, JOB), _read(pool, ROWS), _read(pool, THREADS)
+    if job % 2 == 1 or thread >= threads:
+        return False
+    has_run = False
+    k = first = 0  # the rows before `first` have no range left
+    while k < rows and _read(pool, JOB) == job:
+        row = FIRST_ROW + k * ROW
+        begins = _read(pool, row + BEGINS)
+        count, is_left = 0, begins != WITH
+        if begins == AT_ONCE or (begins == AFTER and _read(pool, row - ROW + DONE) == job):
+            count, is_left = _run_ranges_of_row(pool, job, k, rows, thread, threads)
+        if k == first and not is_left:
+            first += 1
+        if count > 0:
+            has_run = True
+            if _add(pool, row + LEFT, -count) == count:
+                _finish_row(pool, job, k, rows)
+        k = first if count > 0 else k + 1
+    return has_run
+
+
+@kernel(count_references=False)
+def _finish_row(pool, job, k, rows):
+    """Row k is done, and the rows `WITH` it."""
+    n = k
+    while n == k or (n < rows and _read(pool, FIRST_ROW + n * ROW + BEGINS) == WITH):
+        _write(pool, FIRST_ROW + n * ROW + DONE, job)
+        n += 1
+    _add(pool, ROWS_DONE, n - k)
+    _announce(pool)
+
+
+@kernel(count_references=False)
+def _announce(pool):
+    """Let waiting threads see that there may be something to do."""
+    _add(pool, EVENTS, 1)
+    for thread in range(_read(pool, THREADS)):
+        line = FIRST_THREAD + LINE * thread
+        if _read(pool, line + SLEEPS) == 1 and _replace(pool, line + SLEEPS, 1, 0):
+            _wake(_read(pool, line + LOCK))
+
+
+@kernel(count_references=False)
+def _wait(pool, thread, events, polls):
+    """Wait while the number of events is `events`; sleep after POLLS polls. Returns the polls since
+    the thread had something to do, to which `polls` are counted, or since it slept."""
+    while _read(pool, EVENTS) == events:
+        if polls < _read(pool, POLLS):
             polls += 1
             _pause()
         else:
             polls = 0
+            line = FIRST_THREAD + LINE * thread
             _write(pool, line + SLEEPS, 1)
-            if _read(pool, JOB) == job or not _replace(pool, line + SLEEPS, 1, 0):
+            if _read(pool, EVENTS) == events or not _replace(pool, line + SLEEPS, 1, 0):
                 _sleep(_read(pool, line + LOCK))
+    return polls
 
 
-def _run_task(pool, address, task_arguments, blocks):
-    """Run all blocks of a task, with the workers if the pool is free."""
-    workers = _read(pool, WORKERS)
-    if workers == 0 or not _replace(pool, BUSY, 0, 1):
-        for block in range(blocks):
-            call_address(address, task_arguments, block)
+def _run_worker(pool, thread):
+    """Loop of a worker thread; never returns."""
+    polls = 0
+    while True:
+        events = _read(pool, EVENTS)
+        polls = 0 if _run_ranges(pool, thread) else _wait(pool, thread, events, polls)
+
+
+def _run_job(pool, table, rows, status):
+    """Run the rows of a table (rows, COLUMNS), with the workers if the pool is free.
+
+    table, status : addresses; blocks are called while the status is 0
+    """
+    if _read(pool, THREADS) == 1 or not _replace(pool, BUSY, 0, 1):
+        for k in range(rows):
+            row = k * COLUMNS
+            if _read(table, row + BEGINS) != WITH:
+                _call_blocks_of_rows(table, COLUMNS, k, rows, status, 0, _read(table, row + BLOCKS))
         return
-    ranges = min(blocks, MOST_RANGES)
     job = (_read(pool, JOB) // 2 + 1) * 2
     _write(pool, JOB, job - 1)
-    _write(pool, ADDRESS, address)
-    _write(pool, ARGUMENTS, task_arguments)
-    _write(pool, BLOCKS, blocks)
-    _write(pool, DONE, 0)
+    for k in range(rows):
+        row = FIRST_ROW + k * ROW
+        for column in range(COLUMNS):
+            _write(pool, row + column, _read(table, k * COLUMNS + column))
+        _write(pool, row + LEFT, min(_read(table, k * COLUMNS + BLOCKS), MOST_RANGES))
+    _write(pool, ROWS, rows)
+    _write(pool, STATUS, status)
+    _write(pool, ROWS_DONE, 0)
     _write(pool, JOB, job)
-    for index in range(min(workers, ranges - 1)):
-        line = FIRST_WORKER + LINE * index
-        if _read(pool, line + SLEEPS) == 1 and _replace(pool, line + SLEEPS, 1, 0):
-            _wake(_read(pool, line + LOCK))
-    _run_ranges(pool, job, address, task_arguments, blocks, 0, workers + 1)
+    _announce(pool)
     polls = 0
-    while _read(pool, DONE) < ranges:
-        polls += 1
-        if polls < _read(pool, POLLS):
-            _pause()
-        else:
-            polls = 0
-            _write(pool, CALLER_SLEEPS, 1)
-            if _read(pool, DONE) < ranges or not _replace(pool, CALLER_SLEEPS, 1, 0):
-                _sleep(_read(pool, CALLER_LOCK))
+    while True:
+        events = _read(pool, EVENTS)
+        has_run = _run_ranges(pool, 0)
+        if _read(pool, ROWS_DONE) == rows:
+            break
+        polls = 0 if has_run else _wait(pool, 0, events, polls)
     _write(pool, BUSY, 0)
 
 
 def _poll(pool, count):
     """Poll `count` times as a waiting thread does."""
     for _ in range(count):
-        _read(pool, JOB)
+        _read(pool, EVENTS)
         _pause()
+
+
+def _call_run_job(builder, table, rows, status=None):
+    """Code that calls `_run_job` with pointers to the table and the status. Without a status, it is
+    0."""
+    memory = builder.module.globals.get(SYMBOL) or ir.GlobalVariable(builder.module, INT64, SYMBOL)
+    pool = builder.ptrtoint(memory, INT64)
+    status = builder.add(pool, INT64(8 * ZERO)) if status is None else status
+    kind = ir.FunctionType(ir.VoidType(), [INT64] * 4)
+    run_job = function_at(builder, builder.load(memory, typ=INT64), kind)
+    builder.call(run_job, [pool, table, rows, status])
+
+
+@intrinsic
+def run_job(typing, table, rows, status):
+    """Run the first rows of a table, see `_run_job`. table, status : addresses.
+
+    `start_workers` must have been called.
+    """
+
+    def emit(context, builder, signature, arguments):
+        _call_run_job(builder, *arguments)
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.int64, types.int64), emit
 
 
 @intrinsic
@@ -275,17 +380,15 @@ def run_on_all_threads(typing, address, task_arguments, blocks):
     """
 
     def emit(context, builder, signature, arguments):
-        memory = builder.module.globals.get(SYMBOL) or ir.GlobalVariable(
-            builder.module, INT64, SYMBOL
-        )
-        kind = ir.FunctionType(ir.VoidType(), [INT64] * 4)
-        run_task = function_at(builder, builder.load(memory, typ=INT64), kind)
-        content = arguments[1]
+        address, content, blocks = arguments
         if not isinstance(content.type, ir.IntType):
             content = builder.ptrtoint(content, INT64)
-        builder.call(
-            run_task, [builder.ptrtoint(memory, INT64), arguments[0], content, arguments[2]]
-        )
+        table = cgutils.alloca_once(builder, ir.ArrayType(INT64, COLUMNS))
+        table = builder.ptrtoint(table, INT64)
+        for column, value in enumerate((address, content, blocks, INT64(AT_ONCE))):
+            cell = builder.inttoptr(builder.add(table, INT64(8 * column)), POINTER)
+            builder.store(value, cell)
+        _call_run_job(builder, table, INT64(1))
         return context.get_dummy_value()
 
     content = types.intp if isinstance(task_arguments, types.Integer) else task_arguments
@@ -296,7 +399,7 @@ class _ThreadPool:
     """The thread pool of this process: its memory, and the workers that were started."""
 
     def __init__(self):
-        memory = np.zeros(FIRST_WORKER + LINE * (MOST_THREADS + 1), np.int64)
+        memory = np.zeros(FIRST_THREAD + LINE * (MOST_THREADS + 1), np.int64)
         # workers may still read it while Python exits
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(memory))
         self.cells = memory[-memory.ctypes.data % 64 // 8 :]
@@ -306,41 +409,40 @@ class _ThreadPool:
                 name, ctypes.cast(getattr(ctypes.pythonapi, name), ctypes.c_void_p).value
             )
         self.wanted = MOST_THREADS
-        self.started = 0
+        self.started = 1  # with the calling thread
         self.code: list = []
         self._starting = threading.RLock()
 
     def start(self) -> None:
         """Compile the loops of the pool, or read them from the cache. Start the missing workers,
-        and use as many as are wanted."""
+        and use as many threads as are wanted."""
         with self._starting:
             if not self.code:
                 options = compiler_options(count_references=False)
                 self.code = [
                     compile_callback(function, (types.int64,) * count, options)
-                    for function, count in ((_run_task, 4), (_run_worker, 2), (_poll, 2))
+                    for function, count in ((_run_job, 4), (_run_worker, 2), (_poll, 2))
                 ]
-                self.cells[RUN_TASK] = self.code[0].address
-                self.cells[CALLER_LOCK] = _new_lock()
+                self.cells[RUN_JOB] = self.code[0].address
+                self.cells[FIRST_THREAD + LOCK] = _new_lock()
                 poll, count = self._c_function(2), 500
                 fastest = min(
                     timeit.repeat(lambda: poll(self.cells.ctypes.data, count), number=1, repeat=3)
                 )
                 self.cells[POLLS] = max(1, int(count * POLLING_TIME / fastest))
-            workers = self.wanted - 1
-            for index in range(self.started, workers):
-                line = FIRST_WORKER + LINE * index
+            for thread in range(self.started, self.wanted):
+                line = FIRST_THREAD + LINE * thread
                 self.cells[line + LOCK] = _new_lock()
-                loop, arguments = self._c_function(1), (self.cells.ctypes.data, index)
+                loop, arguments = self._c_function(1), (self.cells.ctypes.data, thread)
                 threading.Thread(
-                    target=loop, args=arguments, name=f"rigidmd-{index + 1}", daemon=True
+                    target=loop, args=arguments, name=f"rigidmd-{thread}", daemon=True
                 ).start()
                 while (
                     self.cells[line + SLEEPS] == 0
                 ):  # to start it needs Python's lock, which a run may hold later
                     time.sleep(POLLING_TIME)
                 self.started += 1
-            self.cells[WORKERS] = workers
+            self.cells[THREADS] = self.wanted
 
     def _c_function(self, which: int):
         """A function of two integers that runs without Python's lock."""
@@ -348,13 +450,14 @@ class _ThreadPool:
 
     def reset_after_fork(self) -> None:
         """A child process has no workers."""
-        self.started, self._starting = 0, threading.RLock()
-        self.cells[[WORKERS, BUSY, CALLER_SLEEPS]] = 0
-        self.cells[FIRST_WORKER:] = 0
+        self.started, self._starting = 1, threading.RLock()
+        self.cells[[THREADS, BUSY]] = 1, 0
+        self.cells[FIRST_THREAD:] = 0
         # nothing is left of a job that another thread had begun
-        self.cells[RANGE_JOBS:FIRST_WORKER] = self.cells[JOB]
+        for k in range(MOST_ROWS):
+            self.cells[FIRST_ROW + k * ROW :][BEGUN:ROW] = self.cells[JOB]
         if self.code:
-            self.cells[CALLER_LOCK] = _new_lock()
+            self.cells[FIRST_THREAD + LOCK] = _new_lock()
 
 
 def _new_lock() -> int:
@@ -378,7 +481,6 @@ start_workers = _pool.start
 def set_threads(count: int) -> None:
     """Number of threads that compute, the calling thread included; results do not depend on it."""
     _pool.wanted = count
-    if (
-        _pool.code and count - 1 != _pool.cells[WORKERS]
-    ):  # not before the first task; also after a fork
+    # not before the first task; also after a fork
+    if _pool.code and count != _pool.cells[THREADS]:
         _pool.start()

@@ -103,10 +103,10 @@ class Advance:
         core = parts.core._replace(recovery=self._recovery.rows)
         parts = parts._replace(core=core, code=thermostat_code(scheme.thermostat, core.model))
         table = StepTable(scheme, parts)
-        self._program = bound_program(table.passes, core.status)
+        self.passes, self.program = table.passes, bound_program(table.passes, core.status)
         self._parts, self._call = parts, np.zeros(4, np.int64)
         self._extent, self._sums = np.zeros(len(LargestValues._fields)), np.zeros(SUM_COUNT)
-        steps = self._program.rows, table.intervals, core.registers, self._call
+        steps = self.program.rows, table.intervals, core.registers, self._call
         self._task = BoundTask(
             _advance, (core.model, core.state, core.load, steps, self._extent, self._sums)
         )

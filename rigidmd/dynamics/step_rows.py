@@ -52,6 +52,11 @@ def forces_row(parts: StepParts, which: int, when: int, enough: int = 0) -> Pass
     return Pass(text, _compute_forces, content, when=when)
 
 
+def is_forces_row(row: Pass) -> bool:
+    """Whether a row runs the passes of the terms."""
+    return row.task in (_compute_forces, _compute_gradient)
+
+
 @task()
 def _compute_forces(arguments, block):
     core, row = load_arguments(arguments)

@@ -8,7 +8,7 @@ one file with a NamedTuple and an `@implements(add_forces)`, a new pair potentia
 `@implements(pair_loop.pair)`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Literal, NamedTuple, overload
 
@@ -16,6 +16,7 @@ import numpy as np
 
 from rigidmd.compile import (
     ALWAYS,
+    JOINED,
     Pass,
     Program,
     Rows,
@@ -65,13 +66,6 @@ class Term:
 
     # of a workspace
 
-    #: An array that is used only while forces are computed, which terms share by `with_scratch`.
-    scratch: np.ndarray | None = None
-
-    def with_scratch(self, array: np.ndarray):
-        """The workspace with this array, at least as large as its own, as scratch."""
-        return self
-
     def with_code(self):
         """The workspace with its machine code."""
         return self
@@ -99,15 +93,17 @@ class Term:
             raise ValueError(f"{type(self).__name__} has no checkpoint arrays")
         return self
 
-    def passes(self, into: "Evaluation") -> list[Pass]:
+    def passes(self, into: "Evaluation") -> "TermPasses":
         """Its passes: here one that calls `add_forces`."""
         state, load, tally, status = into
         plain = (self, state, load, status)
         tallied = (self, state, load, tally, status)
-        return [
-            Pass("add forces", _add_plain, plain, when=FORCES_ONLY),
-            Pass("add forces and energies", _add_tallied, tallied, when=TALLIED),
-        ]
+        return TermPasses(
+            loads=[
+                Pass("add forces", _add_plain, plain, when=FORCES_ONLY),
+                Pass("add forces and energies", _add_tallied, tallied, when=TALLIED),
+            ]
+        )
 
 
 @overload
@@ -115,11 +111,11 @@ def trait(
     term: object, name: Literal["absolute_positions", "acts_on_charges", "time_dependent"]
 ) -> bool: ...
 @overload
-def trait(term: object, name: Literal["changes_momentum", "scratch"]) -> np.ndarray | None: ...
+def trait(term: object, name: Literal["changes_momentum"]) -> np.ndarray | None: ...
 @overload
 def trait(
     term: object,
-    name: Literal["workspace", "with_scratch", "with_code", "with_capacity", "restore"],
+    name: Literal["workspace", "with_code", "with_capacity", "restore"],
 ) -> Callable[..., NamedTuple]: ...
 @overload
 def trait(term: object, name: Literal["renew_list"]) -> Callable[[], None]: ...
@@ -128,7 +124,7 @@ def trait(
     term: object, name: Literal["checkpoint_arrays"]
 ) -> Callable[[], dict[str, np.ndarray]]: ...
 @overload
-def trait(term: object, name: Literal["passes"]) -> "Callable[[Evaluation], list[Pass]]": ...
+def trait(term: object, name: Literal["passes"]) -> "Callable[[Evaluation], TermPasses]": ...
 def trait(term: object, name: str) -> object:
     """An attribute of a term, its workspace or the class of either, else the attribute of
     `Term`."""
@@ -139,16 +135,6 @@ def trait(term: object, name: str) -> object:
         return getattr(term, name)
     default = getattr(Term, name)
     return partial(default, term) if callable(default) else default
-
-
-def with_common_scratch(workspaces: tuple[NamedTuple, ...]) -> tuple[NamedTuple, ...]:
-    """The workspaces with one common scratch array, the largest of theirs."""
-    arrays = [trait(workspace, "scratch") for workspace in workspaces]
-    arrays = [array for array in arrays if array is not None]
-    if not arrays:
-        return workspaces
-    largest = max(arrays, key=np.size)
-    return tuple(trait(workspace, "with_scratch")(largest) for workspace in workspaces)
 
 
 def add_forces(term, state, load, tally):
@@ -213,6 +199,51 @@ class Evaluation(NamedTuple):
     status: np.ndarray  # (1,) of the program
 
 
+class TermPasses(NamedTuple):
+    """The passes of a term, by what they may do. Those of one list follow one another.
+
+    `positions` and `forces` run at the same time as those of other terms: they write only to arrays
+    of the term, and none of their tasks calls blocks of others.
+    """
+
+    cell: Sequence[Pass] = ()  # follow the cell
+    positions: Sequence[Pass] = ()  # of sites, in the order in which they are needed
+    lists: Sequence[Pass] = ()  # renew what depends on positions
+    forces: Sequence[Pass] = ()  # and energies, on sites
+    # add to the load, or read it; several blocks are `blocks_of` the molecules
+    loads: Sequence[Pass] = ()
+
+
+def in_order(passes: Sequence[tuple[str, TermPasses]]) -> list[tuple[str, Pass]]:
+    """The passes of terms (name, passes) in the order in which they run, with their names. The
+    order does not depend on numbers of blocks.
+
+    Of chains that run at the same time, the longest is the first, and the last term's of equal
+    ones: the grid of PME has the most passes, which wait for one another, and blocks of pairs fill
+    the time.
+    """
+    rows: list[tuple[str, Pass]] = []
+    for job, field in enumerate(TermPasses._fields, 1):
+        chains = [(name, getattr(of, field)) for name, of in passes]
+        if field in ("positions", "forces"):
+            chains = sorted(reversed(chains), key=_number_without_energies, reverse=True)
+            has_blocks = any(one.blocks > 1 for _, chain in chains for one in chain)
+            for k, (name, chain) in enumerate(chains):
+                rows += [(name, one.in_job(job, k) if has_blocks else one) for one in chain]
+        elif field == "loads":
+            for name, chain in chains:
+                rows += [
+                    (name, one.in_job(job, JOINED) if one.blocks > 1 else one) for one in chain
+                ]
+        else:
+            rows += [(name, one) for name, chain in chains for one in chain]
+    return rows
+
+
+def _number_without_energies(chain: tuple[str, Sequence[Pass]]) -> int:
+    return sum(one.when & FORCES_ONLY != 0 for one in chain[1])
+
+
 @task()
 def _add_plain(arguments, block):
     term, state, load, status = load_arguments(arguments)
@@ -253,11 +284,11 @@ class TermDispatcher:
         self._tallies, self._power = np.zeros((len(workspaces), TALLY_SIZE)), np.zeros(1)
         self._status, valid = np.zeros((2, 1), np.int64)
         self._with_rates = with_rates
-        self._program = Program(self._passes(workspaces, *EXAMPLE), uses, self._status)
+        self.program = Program(self.passes(workspaces, *EXAMPLE), uses, self._status)
         self._rates = Program(
             self._rate_passes(workspaces, EXAMPLE[0]), ALWAYS, np.zeros(1, np.int64)
         )
-        rows = self._program.rows
+        rows = self.program.rows
         elsewhere = np.zeros_like(rows.arguments)
         self.table = TermTable(rows, elsewhere, self._rates.rows, self._tallies, valid, self._power)
         self._bound_to: tuple = ()
@@ -272,11 +303,13 @@ class TermDispatcher:
             target[:] = source
         return self._copy_and_load
 
-    def _passes(self, workspaces: tuple[NamedTuple, ...], state: State, load: Load) -> list[Pass]:
-        passes: list[Pass] = []
-        for workspace, tally in zip(workspaces, self._tallies, strict=True):
-            passes += trait(workspace, "passes")(Evaluation(state, load, tally, self._status))
-        return passes
+    def passes(self, workspaces: tuple[NamedTuple, ...], state: State, load: Load) -> list[Pass]:
+        """The passes of the terms, in the order in which they run."""
+        passes = [
+            ("", trait(workspace, "passes")(Evaluation(state, load, tally, self._status)))
+            for workspace, tally in zip(workspaces, self._tallies, strict=True)
+        ]
+        return [one for _, one in in_order(passes)]
 
     def _rate_passes(self, workspaces: tuple[NamedTuple, ...], state: State) -> list[Pass]:
         dependent = [w for w in workspaces if trait(type(w), "time_dependent")]
@@ -298,10 +331,10 @@ class TermDispatcher:
         are unchanged."""
         bound_to = (*workspaces, *state, *load, *(other or ()))
         if list(map(id, bound_to)) != list(map(id, self._bound_to)):
-            self._program.bind(self._passes(workspaces, state, load))
+            self.program.bind(self.passes(workspaces, state, load))
             self._rates.bind(self._rate_passes(workspaces, state))
             if other is not None:
-                self._program.bind(self._passes(workspaces, state, other), self.table.elsewhere)
+                self.program.bind(self.passes(workspaces, state, other), self.table.elsewhere)
             self._bound_to = bound_to
         return self.table
 

@@ -47,7 +47,7 @@ def test_loops_without_counted_references_take_elements_by_their_index():
         for name, tree, keys in compiled_functions()
         if keys.get("count_references") == "False"
     ]
-    assert {"block_forces", "set_local", "update_list"} <= {name for name, _ in uncounted}
+    assert {"block_forces", "set_local", "build_list"} <= {name for name, _ in uncounted}
     strange = []
     for name, tree in uncounted:
         for node in ast.walk(tree):

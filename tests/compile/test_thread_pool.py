@@ -20,23 +20,30 @@ from support.thread_kernels import count_blocks, counted, run_blocks
 from rigidmd import Every, Simulation, run_together
 from rigidmd.commands.cli import main
 from rigidmd.compile import (
+    ALWAYS,
+    JOINED,
     Code,
+    Pass,
+    Program,
     call_blocks,
     kernel,
     load_arguments,
     pack_arguments,
+    run_passes,
     set_threads,
     task,
 )
 from rigidmd.compile.machine import MOST_THREADS
-from rigidmd.compile.thread_pool import (  # noqa: F401
-    FIRST_WORKER,
-    RANGE_JOBS,
-    SLEEPS,
+from rigidmd.compile.thread_pool import (
+    BEGUN,
+    FIRST_ROW,
+    MOST_ROWS,
+    ROW,
+    _add,
+    _begin_range,
     _pause,
     _pool,
     _read,
-    _run_ranges,
     _write,
 )
 from rigidmd.core.integrators import SCHEMES
@@ -81,41 +88,142 @@ def test_every_block_is_done_once_by_many_more_threads():
     assert done.returncode == 0, done.stderr
 
 
-@task()
-def _note(task_arguments, block):
-    order = load_arguments(task_arguments)
-    order[0] += 1
-    order[order[0]] = block
-
-
 @kernel(from_python=True)
-def _take_alone(cells, job, address, room, blocks, own, threads):
-    return _run_ranges(cells, job, address, room, blocks, own, threads)
+def _begin_all(cells, job, ranges, at, step):
+    """The ranges of the first row that a thread begins, in their order."""
+    found = []
+    at = _begin_range(cells, job, FIRST_ROW, ranges, at, step)
+    while at >= 0:
+        found.append(at)
+        at = _begin_range(cells, job, FIRST_ROW, ranges, at, step)
+    return found
 
 
 @pytest.mark.parametrize(
-    ("own", "threads", "claimed", "expected"),
+    ("at", "step", "begun", "expected"),
     [
-        (0, 2, [0] * 6, [0, 1, 2, 3, 4, 5]),
-        (1, 2, [0] * 6, [5, 4, 3, 2, 1, 0]),
-        (0, 2, [0, 4, 2, 0, 4, 4], [0, 2, 3]),  # the others are claimed
-        (2, 3, [0] * 6, [4, 5, 0, 1, 2, 3]),
-        (1, 3, [0] * 6, [3, 2, 1, 0, 5, 4]),
-        (1, 2, [4, 4, 6, 4, 8, 6], []),  # the job has ended, others have begun
-        (3, 8, [0] * 6, [2, 1, 0, 5, 4, 3]),  # more threads than blocks
-        (1, 16, [0] * 6, [0, 5, 4, 3, 2, 1]),  # more than twice as many
+        (0, 1, [0] * 6, [0, 1, 2, 3, 4, 5]),
+        (5, -1, [0] * 6, [5, 4, 3, 2, 1, 0]),
+        (0, 1, [0, 4, 2, 0, 4, 4], [0, 2, 3]),  # the others have begun
+        (4, 1, [0] * 6, [4, 5, 0, 1, 2, 3]),
+        (3, -1, [0] * 6, [3, 2, 1, 0, 5, 4]),
+        (5, -1, [4, 4, 6, 4, 8, 6], []),  # the job has ended, others have begun
     ],
 )
-def test_each_thread_begins_with_its_fraction_and_continues_with_what_is_left(
-    own, threads, claimed, expected
-):
-    cells, order = np.zeros(FIRST_WORKER, np.int64), np.zeros(7, np.int64)
-    cells[RANGE_JOBS : RANGE_JOBS + 6] = claimed
-    code = Code(note=(_note, order))
-    struct = code.to_struct(order)
-    last = _take_alone(cells.ctypes.data, 4, code.address("note"), struct.address, 6, own, threads)
-    assert order[1 : order[0] + 1].tolist() == expected
-    assert last == (len(expected) == 6)
+def test_a_thread_continues_with_what_is_left(at, step, begun, expected):
+    cells = np.zeros(FIRST_ROW + ROW, np.int64)
+    cells[FIRST_ROW + BEGUN :][:6] = begun
+    assert list(_begin_all(cells.ctypes.data, 4, 6, at, step)) == expected
+
+
+@task()
+def _enter(task_arguments, block):
+    """Enter a number and the block into the next line of a log, after some work."""
+    number, work, log, status = load_arguments(task_arguments)
+    total = 0.0
+    for n in range(work):
+        total += np.sqrt(n + block)
+    at = _add(log.ctypes.data, 0, 1) + 1
+    log[at, 0], log[at, 1], log[at, 2] = number, block, total
+    if number == 9:
+        status[0] = 9
+
+
+@kernel(from_python=True)
+def _run_program(rows):
+    return run_passes(rows, rows.arguments, ALWAYS)
+
+
+def entered(rows: list[tuple[int, int, int, int, int]]) -> tuple[np.ndarray, int]:
+    """The lines that passes (number, blocks, job, chain, work) enter, and their status."""
+    status = np.zeros(1, np.int64)
+    log = np.zeros((1 + sum(row[1] for row in rows), 3), np.int64)
+    passes = [
+        Pass("", _enter, (number, work, log, status), blocks, job=job, chain=chain)
+        for number, blocks, job, chain, work in rows
+    ]
+    program = Program(passes, ALWAYS, status)
+    program.bind(passes)
+    found = _run_program(program.rows)
+    return log[1 : 1 + log[0, 0], :2], found
+
+
+#: number, blocks, job, chain: a grid with serial passes, two chains of pairs, sums on molecules
+ROWS = [
+    *((0, 3, 0, 0), (1, 1, 0, 0)),
+    *((2, 8, 1, 0), (3, 1, 1, 0), (4, 8, 1, 0), (5, 1, 1, 0)),
+    *((6, 16, 1, 1), (7, 16, 1, 1), (8, 5, 1, 2), (10, 2, 1, 2)),
+    *((11, 6, 2, JOINED), (12, 6, 2, JOINED), (13, 4, 2, JOINED), (14, 1, 0, 0), (15, 9, 3, 0)),
+]
+
+
+@pytest.mark.parametrize("threads", [1, 2, MOST_THREADS])
+@pytest.mark.parametrize("work", [0, 3000])
+def test_passes_follow_those_of_their_chain_and_all_of_earlier_jobs(threads, work):
+    set_threads(min(threads, MOST_THREADS))
+    for _ in range(30):
+        lines, status = entered([(*row, work) for row in ROWS])
+        assert status == 0
+        moments: dict[int, list[int]] = {}
+        for moment, (number, _) in enumerate(lines.tolist()):
+            moments.setdefault(number, []).append(moment)
+        for number, blocks, job, chain in ROWS:
+            assert sorted(lines[lines[:, 0] == number, 1].tolist()) == list(range(blocks))
+            for before, _, job_before, chain_before in ROWS:
+                if before < number and (job_before, chain_before) == (job, chain) != (2, JOINED):
+                    assert max(moments[before]) < min(moments[number])
+                if before < number and (job_before != job or job == 0):
+                    assert max(moments[before]) < min(moments[number])
+        for block in range(6):  # joined: on one thread, one after the other
+            first, second = (lines.tolist().index([number, block]) for number in (11, 12))
+            assert first < second
+        assert max(moments[12]) < min(moments[13])  # it has other blocks
+
+
+@task()
+def _meet(task_arguments, block):
+    """Wait until the other of two passes has begun, and note whether it has."""
+    which, begun, most = load_arguments(task_arguments)
+    cells = begun.ctypes.data
+    _write(cells, which, 1)
+    polls = 0
+    while _read(cells, 1 - which) == 0 and polls < most:
+        polls += 1
+        _pause()
+    _write(cells, 2 + which, _read(cells, 1 - which))
+
+
+@pytest.mark.skipif(MOST_THREADS == 1, reason="one core")
+@pytest.mark.parametrize(("chains", "expected"), [((0, 1), [1, 1]), ((0, 0), [0, 1])])
+def test_two_chains_run_at_the_same_time_and_one_in_its_order(chains, expected):
+    """Passes of two chains that wait for each other would else hang until the limit of this test."""
+    begun = np.zeros(4, np.int64)
+    most = 10**12 if chains == (0, 1) else 1000
+    passes = [
+        Pass("", _meet, (which, begun, most), job=1, chain=chain)
+        for which, chain in enumerate(chains)
+    ]
+    program = Program(passes, ALWAYS, np.zeros(1, np.int64))
+    program.bind(passes)
+    assert _run_program(program.rows) == 0
+    assert begun[2:].tolist() == expected
+
+
+@pytest.mark.parametrize("threads", [1, MOST_THREADS])
+def test_no_block_is_called_after_a_pass_has_failed(threads):
+    """Not even in the same job: they would read what it has left. The pool is then free."""
+    set_threads(threads)
+    for _ in range(20):
+        lines, status = entered([(9, 1, 1, 0, 0), (1, 40, 1, 0, 0), (2, 3, 0, 0, 0)])
+        assert (lines.tolist(), status) == ([[9, 0]], 9)
+    assert (counted(16, 10, 10)[:, 0] == 10).all()
+
+
+def test_a_job_of_more_rows_than_the_pool_has_is_several_jobs():
+    set_threads(MOST_THREADS)
+    rows = [(n + 20, 2, 1, n % 7, 0) for n in range(2 * MOST_ROWS + 5)]
+    lines, _ = entered(rows)
+    assert sorted(lines.tolist()) == [[number, block] for number, *_ in rows for block in (0, 1)]
 
 
 def test_a_block_may_have_blocks_of_its_own():
@@ -310,13 +418,13 @@ def test_what_cannot_run_together_is_refused(twice, jobs, word):
 HELPER = """
 import time
 from rigidmd.compile import set_threads
-from rigidmd.compile.thread_pool import FIRST_WORKER, SLEEPS, _pool
+from rigidmd.compile.thread_pool import FIRST_THREAD, LINE, SLEEPS, _pool
 from support.thread_kernels import met
 set_threads(1)
 assert met(1000) == [0, 1]
 set_threads(2)
 assert met(10**12) == [1, 1]
-while not _pool.cells[FIRST_WORKER + SLEEPS]:
+while not _pool.cells[FIRST_THREAD + LINE + SLEEPS]:
     time.sleep(0.01)
 assert met(10**12) == [1, 1]
 """
@@ -344,7 +452,7 @@ def test_a_forked_process_starts_its_own_threads():
             run_blocks(code, seen, 10, 100)  # without helpers, then with new ones
             set_threads(MOST_THREADS)
             run_blocks(code, seen, 10, 100)
-            done = 0 if (seen[:, 0] == 200).all() and _pool.started == MOST_THREADS - 1 else 2
+            done = 0 if (seen[:, 0] == 200).all() and _pool.started == MOST_THREADS else 2
         finally:
             os._exit(done)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0

@@ -26,7 +26,7 @@ TESTED_BY = {
     "dynamics/test_thermostats.py": "assemble/stage_description",
     "end_to_end/test_faults.py": "core/files core/signals",
     "end_to_end/test_hostile_input.py": "core/process core/toml",
-    "engines/cpu/test_program.py": "compile/program engines/cpu/compiled engines/protocol",
+    "engines/cpu/test_program.py": "compile/program compile/stopwatch engines/cpu/compiled engines/protocol",
     "forces/fields/test_fields.py": "scene/fields",
     "assemble/test_species.py": "scene/species",
     "rules/test_schema.py": "commands/schema",

@@ -36,8 +36,8 @@ from rigidmd.forces.terms import (
     Setup,
     TermDispatcher,
     compute_load_with_energies,
+    in_order,
     trait,
-    with_common_scratch,
 )
 from rigidmd.mechanics.free_rotor import NO_SYMMETRY, ExactRotor, SplitRotor
 
@@ -253,7 +253,7 @@ class CompiledEngine(Engine, Generic[ModelT, Bound]):
                 trait(workspace, "restore")(arrays_of.get(name, {}), self._setup.skin)
                 for name, workspace in pairs
             )
-        self._workspaces = with_common_scratch(spaces)
+        self._workspaces = spaces
 
     def _check_recalled(self, state: State, arrays_of: dict[str, dict[str, np.ndarray]]) -> None:
         """Raise ValueError unless the kept forces are those of this code at the state."""
@@ -269,21 +269,22 @@ class CompiledEngine(Engine, Generic[ModelT, Bound]):
                 raise ValueError(f"its state has another {name} than was kept with it")
         self._recall_lists(state, arrays_of)  # the evaluation may have built others
 
-    def passes(self, state: State) -> dict[str, list[Pass]]:
-        """Name of a term -> its passes at a state, in their order. Nothing is compiled."""
+    def passes(self, state: State) -> list[tuple[str, Pass]]:
+        """The passes of the forces at a state, in their order, each with the name of its term.
+        Nothing is compiled."""
         load = no_load(state)
         status = np.zeros(1, np.int64)
         into = Evaluation(state, load, np.zeros(TALLY_SIZE), status)
         workspaces = zip(self.names, self.new_workspaces(state), strict=False)
-        return {name: trait(workspace, "passes")(into) for name, workspace in workspaces}
+        return in_order([(name, trait(of, "passes")(into)) for name, of in workspaces])
 
     def new_workspaces(self, state: State) -> tuple[NamedTuple, ...]:
         """New workspaces for the cell of a state, without machine code. Their arrays show the
         memory needed."""
         setup = self._setup._replace(cell=state.cell)
-        return with_common_scratch(
-            tuple(trait(term, "workspace")(setup) for term in self.terms.values())
-        ) or (NoForce(),)
+        return tuple(trait(term, "workspace")(setup) for term in self.terms.values()) or (
+            NoForce(),
+        )
 
     def _prepare(self, state: State) -> tuple[NamedTuple, ...]:
         """Check the arrays of a state for compiled code, and return the workspaces, which the first
@@ -311,8 +312,9 @@ class CompiledEngine(Engine, Generic[ModelT, Bound]):
         again."""
         workspaces = self._prepare(state)
         if status in (LIST_FULL, CELL_CHANGED):
-            enlarged = tuple(trait(space, "with_capacity")(state.cell) for space in workspaces)
-            workspaces = self._workspaces = with_common_scratch(enlarged)
+            workspaces = self._workspaces = tuple(
+                trait(space, "with_capacity")(state.cell) for space in workspaces
+            )
         elif status == NOT_FINITE:
             raise NotFiniteError(state)
         elif status == NEEDS_PYTHON_FORCES:

@@ -17,6 +17,7 @@ from rigidmd.dynamics.observables import LargestValues, StateSums, sums_of_state
 from rigidmd.dynamics.registers import KEPT_BY_BAROSTAT, KEPT_BY_EXTENSION, new_registers
 from rigidmd.dynamics.step_loop import Advance
 from rigidmd.dynamics.step_parts import StepCore, StepExtension, StepParts, extension_of
+from rigidmd.dynamics.step_rows import is_forces_row
 from rigidmd.dynamics.thermostats import thermostat_workspace
 from rigidmd.engines.cpu.compiled import CompiledEngine, Steps
 from rigidmd.engines.protocol import Tally
@@ -192,6 +193,23 @@ class CpuEngine(CompiledEngine[Model, Advance]):
     def rows_of_steps(self) -> Rows:
         """The rows of the forces of steps, bound to the state that `advance` has moved last."""
         return self._dispatchers["steps"].table.rows
+
+    def measure(self, state: State) -> list[tuple[str, int, np.ndarray]]:
+        """Measure the rows of steps from now on, without those of its forces as a whole.
+
+        state : that `advance` has moved last
+
+        Returns the text of each row, its number of blocks, and the times of its blocks, see
+        `Program.measure`.
+        """
+        assert self._bound is not None
+        steps = self._bound[1]
+        forces = [(f"{name}: {one.text}", one.blocks) for name, one in self.passes(state)]
+        moves = [(one.text, one.blocks) for one in steps.passes]
+        spent = self._dispatchers["steps"].program.measure()
+        rows = [(*text, of) for text, of in zip(forces, spent, strict=True)]
+        of_steps = zip(moves, steps.passes, steps.program.measure(), strict=True)
+        return rows + [(*text, of) for text, one, of in of_steps if not is_forces_row(one)]
 
     def _prepare(self, state: State) -> tuple[NamedTuple, ...]:
         set_threads(usable_threads(self.threads))

@@ -2,10 +2,12 @@
 how many blocks, when."""
 
 import time
-from statistics import median
+from operator import itemgetter
 from typing import NamedTuple
 
-from rigidmd.compile import run_row
+import numpy as np
+
+from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import State, no_load
 from rigidmd.dynamics.step_table import StepTable
@@ -31,62 +33,85 @@ def program_of_forces(engine: CpuEngine, state: State) -> list[Row]:
     """The rows of an evaluation of forces, in order. Nothing is compiled."""
     return [
         Row(f"{name}: {one.text}", one.blocks, _when(one.when))
-        for name, passes in engine.passes(state).items()
-        for one in passes
+        for name, one in engine.passes(state)
     ]
 
 
-#: Steps before a profile, and steps that it measures.
-SETTLING, MEASURED = 20, 50
+#: Steps before a measurement, steps that it has, and measurements for each number of threads.
+SETTLING, MEASURED, ROUNDS = 20, 30, 5
 
 
 class Profile(NamedTuple):
-    """Median times of a step and its rows, without energies."""
+    """Times of a step and its rows on numbers of threads, the first of which is 1; s."""
 
-    step: float  # s
-    #: Text and s of each row of the forces; the last one is the rest of the step
-    rows: list[tuple[str, float]]
+    threads: tuple[int, ...]
+    steps: tuple[float, ...]
+    #: text and times of each row; the last one is the rest of the step
+    rows: list[tuple[str, tuple[float, ...]]]
+    idle: float  # fraction of the time of all threads in which they have no blocks to run
 
 
 def profile_of(engine: CpuEngine, state: State, scheme: Scheme, dt: float) -> Profile:
-    """Measure the rows of the forces over some steps from a state, which is copied. dt in ps.
+    """Measure the rows of steps from a state, which is copied, on one thread and on as many as the
+    engine uses. dt in ps.
 
-    Each row is timed by itself, after steps that move the molecules, so that the list is updated as
-    in a run. Raises SimulationError.
+    The time of a row of several blocks is the processor time of its blocks divided by the number of
+    threads, as such rows run at the same time; of one with a single block, the time that it takes.
+    Of the rounds for a number of threads, the one with the median time of a step counts. The engine
+    measures all later steps too. Raises SimulationError.
     """
+    numbers = tuple(dict.fromkeys((1, usable_threads(engine.threads))))
     state = engine.begin(state, scheme)
     engine.advance(state, scheme, dt, SETTLING)
-    rows = engine.rows_of_steps()
-    texts = [
-        f"{name}: {one.text}" for name, passes in engine.passes(state).items() for one in passes
-    ]
-    used = [k for k, when in enumerate(rows.when) if when & FORCES_ONLY]
-    times: dict[int, list[float]] = {k: [] for k in used}
-    steps: list[float] = []
-    for n in range(MEASURED):
+    rows = engine.measure(state)
+    rounds: dict[int, list[tuple[float, np.ndarray]]] = {count: [] for count in numbers}
+    for count in ROUNDS * numbers:
+        engine.threads = count
+        until = int(state.step[0]) + SETTLING
+        engine.advance(state, scheme, dt, until)
+        for _, _, spent in rows:
+            spent[:] = 0
         began = time.perf_counter()
-        engine.advance(state, scheme, dt, SETTLING + n + 1)
-        steps.append(time.perf_counter() - began)
-        for load in engine.load or ():
-            load[:] = 0.0
-        for k in used:
-            began = time.perf_counter()
-            run_row(rows, k)
-            times[k].append(time.perf_counter() - began)
-    step = median(steps)
-    times_of_passes = [(texts[k], median(spent)) for k, spent in times.items()]
-    remainder = step - scheme.force_evaluations * sum(spent for _, spent in times_of_passes)
-    return Profile(step, [*times_of_passes, ("kicks, drifts, and all else", max(0.0, remainder))])
+        engine.advance(state, scheme, dt, until + MEASURED)
+        step = (time.perf_counter() - began) / MEASURED
+        busy = np.array([spent.sum() for _, _, spent in rows]) / (1e9 * MEASURED)
+        rounds[count].append((step, busy))
+    middle = [sorted(rounds[count], key=itemgetter(0))[ROUNDS // 2] for count in numbers]
+    (_, alone), (step, busy) = middle[0], middle[-1]
+    most = numbers[-1]
+    is_single = np.array([blocks == 1 for _, blocks, _ in rows])
+    # a single block may call blocks of others on all threads, as when a list is built
+    work = np.where(is_single, np.maximum(busy, np.minimum(alone, most * busy)), busy)
+    times = [
+        np.where(is_single, of, of / count) for count, (_, of) in zip(numbers, middle, strict=True)
+    ]
+    steps = tuple(step for step, _ in middle)
+    lines = [
+        (text, tuple(float(of[k]) for of in times))
+        for k, (text, _, _) in enumerate(rows)
+        if alone[k] > 0
+    ]
+    rest = tuple(step - float(of.sum()) for step, of in zip(steps, times, strict=True))
+    idle = max(0.0, 1 - float(work.sum()) / (most * step))
+    return Profile(numbers, steps, [*lines, ("waiting, and all else", rest)], idle)
 
 
 def describe_profile(profile: Profile) -> str:
-    """A table with the rows of a profile and their fractions of a step."""
-    width = max(len(text) for text, _ in profile.rows)
-    lines = [
-        f"  {text:<{width}} {1e6 * spent:>9.1f} {spent / profile.step:>6.1%}"
-        for text, spent in profile.rows
-    ]
-    return "\n".join([f"  {'a step':<{width}} {1e6 * profile.step:>9.1f} µs", *lines])
+    """A table with the rows of a profile: times, gain by threads, fraction of a step."""
+    numbers, steps, rows, idle = profile
+    width = max(len(text) for text, _ in rows)
+    several = len(numbers) > 1
+    heads = [f"{count} thread{'s' * (count > 1)}" for count in numbers]
+    heads = [f"{head:>11}" for head in [*heads, *(["gain"] if several else []), "of a step"]]
+    lines = [f"  {'time, µs':<{width}} {''.join(heads)}"]
+    for text, times in [*rows, ("a step", steps)]:
+        cells = [f"{1e6 * spent:>11.1f}" for spent in times]
+        gain = f"{times[0] / times[-1]:.2f}" if min(times) > 0 and text != rows[-1][0] else ""
+        cells += [f"{gain:>11}"] if several else []
+        lines.append(f"  {text:<{width}} {''.join(cells)}{times[-1] / steps[-1]:>11.1%}")
+    if several:
+        lines.append(f"  idle: {idle:.1%} of the time of {numbers[-1]} threads")
+    return "\n".join(lines)
 
 
 def _when(bits: int) -> str:

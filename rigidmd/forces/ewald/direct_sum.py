@@ -18,12 +18,13 @@ from rigidmd.forces.ewald.smooth import InverseR, Smooth, slope, strength_times_
 from rigidmd.forces.neighbors.sites import (
     BodySites,
     CentralSites,
-    load_passes,
+    load_pass,
     position_pass,
+    sum_passes,
     virial_buffer,
 )
 from rigidmd.forces.neighbors.space import follow_cell
-from rigidmd.forces.terms import Evaluation, Setup
+from rigidmd.forces.terms import Evaluation, Setup, TermPasses
 
 SAME_BASIS = np.eye(3, dtype=int)  #: of a cell whose edges are those of its description
 
@@ -189,23 +190,25 @@ class EwaldWorkspace(NamedTuple):
         """Forces (s, 3) on its sites as last evaluated, lab frame, u Å/ps²."""
         return self.sums.force
 
-    def passes(self, into: Evaluation) -> list[Pass]:
+    def passes(self, into: Evaluation) -> TermPasses:
         """Positions. Strengths, if the cell has changed. Phases, structure factors, and forces."""
         sums = self.sums
         content = (self.smooth, self.k_vectors, self.sums)
         blocks = len(sums.tallies)
-        return [
-            position_pass(self.sites, into.state, sums.position),
-            Pass(
-                "strengths of k-vectors, if the cell has changed",
-                _follow_cell,
-                (*content, into.state),
-            ),
-            Pass("phases of sites", _compute_phases, content, blocks),
-            Pass("structure factors", _sum_structure_factors, content, blocks),
-            Pass("forces on sites", _compute_forces, content, blocks),
-            *load_passes(self.sites, into, sums.force, sums),
-        ]
+        strengths = "strengths of k-vectors, if the cell has changed"
+        return TermPasses(
+            cell=[Pass(strengths, _follow_cell, (*content, into.state))],
+            positions=[
+                position_pass(self.sites, into.state, sums.position),
+                Pass("phases of sites", _compute_phases, content, blocks),
+            ],
+            forces=[
+                Pass("structure factors", _sum_structure_factors, content, blocks),
+                Pass("forces on sites", _compute_forces, content, blocks),
+                *sum_passes(self.sites, into, sums.force, sums),
+            ],
+            loads=[load_pass(self.sites, into, sums.force)],
+        )
 
 
 @kernel

@@ -25,7 +25,7 @@ MAX_PROXY_POINTS, SEARCH_PROXY_POINTS = 32, 16
 #: Shortest real-space cutoff that is tried; time of a pair within a cutoff and a margin, on the
 #: scale of the costs of grids. Measured in mixed precision with 12288 sites, cutoffs of 6 to 9 Å
 #: and accuracies of 1e-4 to 1e-5.
-SHORTEST_CUTOFF, LIST_MARGIN, PAIR_NS = 5.0, 1.0, 1.0
+SHORTEST_CUTOFF, LIST_MARGIN, PAIR_NS = 5.0, 1.0, 1.3
 ORDERS = (4, 5, 6, 7, 8)
 COARSE_SPACING = 3.0  # Å, for a liquid
 SPACINGS = COARSE_SPACING * 0.98 ** np.arange(-250, 150)  # Å, from which grids are chosen
@@ -317,7 +317,7 @@ def _fastest_grid(
         )
         if k < len(grids):
             # measured with 12288 sites, orders 4 to 8, grids of 32³ to 54³
-            cost = charges.count * (20 + 2.4 * p**2) + 8.0 * float(np.prod(grids[k]))
+            cost = charges.count * (45 + 1.85 * p**2) + 9.5 * float(np.prod(grids[k]))
             if cost < cheapest:
                 best = (grids[k], p)
                 cheapest = cost

@@ -37,13 +37,15 @@ from rigidmd.forces.ewald.smooth import InverseR, Smooth, strength_times_square
 from rigidmd.forces.neighbors.sites import (
     BodySites,
     CentralSites,
-    load_passes,
-    position_pass,
+    load_pass,
+    locate_site,
+    sum_passes,
     virial_buffer,
 )
 from rigidmd.forces.neighbors.space import follow_cell
-from rigidmd.forces.terms import FORCES_ONLY, TALLIED, Evaluation, Setup
+from rigidmd.forces.terms import FORCES_ONLY, TALLIED, Evaluation, Setup, TermPasses
 
+STRIP = 4  # rows of a plane, whose sites are neighbours in the order
 PLANES = 16  # of a block, if there are more blocks than the minimum
 SERIAL_POINTS = 16**3  # up to this number of grid points there is one block, on the main thread
 
@@ -81,20 +83,22 @@ class PmeMesh(NamedTuple):
     around."""
 
     points: np.ndarray  # (3,) number along a, b, c
-    bounds: np.ndarray  # (3, blocks + 1) of planes, rows of Fourier components and sites
+    strides: np.ndarray  # (2,) of planes and rows in `flat`
+    # (4, blocks + 1) of planes, rows of Fourier components, sites, molecules
+    bounds: np.ndarray
     cell: np.ndarray  # (3, 3)
     reciprocal: np.ndarray  # (3, 3) rows 2 pi times the reciprocal edges, 1/Å
-    position: np.ndarray  # (s, 3)
     force: np.ndarray  # (s, 3)
     corner: np.ndarray  # (s, 3) int32 first grid point to which a site is spread
     # (s, 4) position of a site minus corner minus 1/2, in grid cells; its charge
     offset: np.ndarray
-    # (blocks, n_a) of the sites of a block: how many have their corner in a plane; then where in
-    # `order` the next one goes
-    next_of_plane: np.ndarray
-    order: np.ndarray  # (s,) int32 sites sorted by the plane of their corner
+    # (blocks, n_a, strips) of the sites of a block: how many have their corner in a strip; then
+    # where in `order` the next one goes
+    next_of_strip: np.ndarray
+    order: np.ndarray  # (s,) int32 sites sorted by the strip of their corner
     first: np.ndarray  # (n_a + 1,) plane p has sites order[first[p]] ... order[first[p + 1] - 1]
     grid: np.ndarray  # (n_a, n_b + order - 1, n_c + width) charges, then potential
+    flat: np.ndarray  # (points,) the same memory
     spectrum: np.ndarray  # (n_a, n_b, n_c//2 + 1)
     influence: np.ndarray  # (n_a, n_b, n_c//2 + 1) potential over charge, by Fourier component
     alias: np.ndarray  # (3, 6, most points) errors.Aliases of the axes
@@ -131,20 +135,25 @@ class Pme(NamedTuple):
         table = np.zeros((3, 6, max(grid)))
         for d in range(3):
             table[d, :, : grid[d]] = aliases(grid[d], order)
+        padded = np.zeros((grid[0], grid[1] + order - 1, grid[2] + width), kind)
         spectrum_shape = (grid[0], grid[1], grid[2] // 2 + 1)
+        molecules = len(self.sites.first) - 1
+        bounds = np.linspace(0, [*grid[:2], s, molecules], blocks + 1).astype(np.int64).T.copy()
+        bounds[2] = self.sites.first[bounds[3]]
         mesh = PmeMesh(
             points=np.array(grid, np.int64),
-            bounds=np.linspace(0, [grid[0], grid[1], s], blocks + 1).astype(np.int64).T.copy(),
+            strides=np.array([padded[0].size, padded[0, 0].size]),
+            bounds=bounds,
             cell=np.zeros((3, 3)),
             reciprocal=np.zeros((3, 3)),
-            position=np.zeros((s, 3)),
             force=np.zeros((s, 3)),
             corner=np.zeros((s, 3), np.int32),
             offset=np.zeros((s, 4), kind),
-            next_of_plane=np.zeros((blocks, grid[0]), np.int64),
+            next_of_strip=np.zeros((blocks, grid[0], (grid[1] - 1) // STRIP + 1), np.int64),
             order=np.zeros(s, np.int32),
             first=np.zeros(grid[0] + 1, np.int64),
-            grid=np.zeros((grid[0], grid[1] + order - 1, grid[2] + width), kind),
+            grid=padded,
+            flat=padded.reshape(-1),
             spectrum=np.zeros(spectrum_shape, pair),
             influence=np.zeros(spectrum_shape, kind),
             alias=table,
@@ -177,40 +186,36 @@ class PmeWorkspace(NamedTuple):
     def with_code(self) -> "PmeWorkspace":
         return self._replace(code=Code(influence=(_set_influence, self._content)))
 
-    def passes(self, into: Evaluation) -> list[Pass]:
-        """Positions. The influence function, if the cell has changed. Charges on the grid, and the
+    def passes(self, into: Evaluation) -> TermPasses:
+        """The influence function, if the cell has changed. Positions, charges on the grid, and the
         forces."""
-        mesh, content = self.mesh, self._content
+        mesh, content, sites = self.mesh, self._content, self.sites
         blocks = len(mesh.tallies)
-        return [
-            position_pass(self.sites, into.state, mesh.position),
-            Pass(
-                "influence function, if the cell has changed",
-                _follow_cell,
-                (self.code, *content, into.state),
-            ),
-            Pass("positions in grid cells", _scale_positions, content, blocks),
-            Pass("first site of each plane", _find_first_sites, (mesh, into.status)),
-            Pass("sort sites by plane", _sort_sites, (mesh,), blocks),
-            Pass("charges on the grid, transform of planes", _spread_charges, content, blocks),
-            Pass(
-                "transform across planes, times influence",
-                _convolve,
-                (self.smooth, mesh, None),
-                blocks,
-                FORCES_ONLY,
-            ),
-            Pass(
-                "the same, with energy and virial",
-                _convolve,
-                (self.smooth, mesh, mesh.tallies),
-                blocks,
-                TALLIED,
-            ),
-            Pass("transform of planes to the potential", _transform_back, content, blocks),
-            Pass("forces on sites", _interpolate_forces, content, blocks),
-            *load_passes(self.sites, into, mesh.force, mesh),
-        ]
+        follow = (self.code, *content, into.state)
+        plain, tallied = (self.smooth, mesh, None), (self.smooth, mesh, mesh.tallies)
+        across = "transform across planes, times influence"
+        return TermPasses(
+            cell=[Pass("influence function, if the cell has changed", _follow_cell, follow)],
+            positions=[
+                Pass(
+                    "positions in grid cells",
+                    _find_cells,
+                    (sites, into.state, self.charge, mesh),
+                    blocks,
+                ),
+                Pass("first site of each plane", _find_first_sites, (mesh, into.status)),
+                Pass("sort sites by plane", _sort_sites, (mesh,), blocks),
+            ],
+            forces=[
+                Pass("charges on the grid, transform of planes", _spread_charges, content, blocks),
+                Pass(across, _convolve, plain, blocks, FORCES_ONLY),
+                Pass(f"{across}, energy and virial", _convolve, tallied, blocks, TALLIED),
+                Pass("transform of planes to the potential", _transform_back, content, blocks),
+                Pass("forces on sites", _interpolate_forces, content, blocks),
+                *sum_passes(sites, into, mesh.force, mesh),
+            ],
+            loads=[load_pass(sites, into, mesh.force)],
+        )
 
 
 @task(count_references=False)
@@ -271,24 +276,29 @@ def _set_influence(arguments, block):
 
 
 @task(count_references=False)
-def _scale_positions(arguments, block):
-    """Positions of the sites of a block in grid cells, and their number in each plane."""
-    _smooth, charge, _spline, mesh = load_arguments(arguments)
+def _find_cells(arguments, block):
+    """Grid cells of the sites of a block of molecules, and the number of sites in each plane."""
+    sites, state, charge, mesh = load_arguments(arguments)
     mesh.not_finite[block] = False
-    mesh.next_of_plane[block] = 0
-    r, b = mesh.position, mesh.reciprocal
-    for i in range(mesh.bounds[2, block], mesh.bounds[2, block + 1]):
-        for d in range(3):
-            turns = (r[i, 0] * b[d, 0] + r[i, 1] * b[d, 1] + r[i, 2] * b[d, 2]) * (0.5 / pi)
-            x = (turns - np.floor(turns)) * mesh.points[d]
-            if not abs(x) < 1e9:
-                mesh.not_finite[block] = True
-                return
-            corner = int(x)
-            mesh.offset[i, d] = x - corner - 0.5
-            mesh.corner[i, d] = corner if corner < mesh.points[d] else 0
-        mesh.offset[i, 3] = charge[i]
-        mesh.next_of_plane[block, mesh.corner[i, 0]] += 1
+    mesh.next_of_strip[block] = 0
+    strips = mesh.next_of_strip[block]
+    b, points = mesh.reciprocal, mesh.points
+    for m in range(mesh.bounds[3, block], mesh.bounds[3, block + 1]):
+        for n in range(sites.first[m], sites.first[m + 1]):
+            i = np.uint64(n)
+            r = locate_site(sites, state, m, n)
+            offset, cell = mesh.offset[i], mesh.corner[i]
+            for d in range(3):
+                turns = (r[0] * b[d, 0] + r[1] * b[d, 1] + r[2] * b[d, 2]) * (0.5 / pi)
+                x = (turns - np.floor(turns)) * points[d]
+                if not abs(x) < 1e9:
+                    mesh.not_finite[block] = True
+                    return
+                corner = np.int32(x)
+                offset[d] = x - corner - 0.5
+                cell[d] = corner if corner < points[d] else 0
+            offset[3] = charge[i]
+            strips[np.uint32(cell[0]), np.uint32(cell[1]) // np.uint32(STRIP)] += 1
 
 
 @task(count_references=False)
@@ -303,10 +313,11 @@ def _find_first_sites(arguments, block):
     begin = 0
     for plane in range(mesh.points[0]):
         mesh.first[plane] = begin
-        for b in range(len(mesh.not_finite)):
-            count = mesh.next_of_plane[b, plane]
-            mesh.next_of_plane[b, plane] = begin
-            begin += count
+        for strip in range(mesh.next_of_strip.shape[2]):
+            for b in range(len(mesh.not_finite)):
+                count = mesh.next_of_strip[b, plane, strip]
+                mesh.next_of_strip[b, plane, strip] = begin
+                begin += count
     mesh.first[mesh.points[0]] = begin
 
 
@@ -314,11 +325,11 @@ def _find_first_sites(arguments, block):
 def _sort_sites(arguments, block):
     """Enter the sites of a block into the order by planes. The sort is stable."""
     (mesh,) = load_arguments(arguments)
-    following = mesh.next_of_plane[block]
+    following = mesh.next_of_strip[block]
     for i in range(mesh.bounds[2, block], mesh.bounds[2, block + 1]):
-        plane = mesh.corner[i, 0]
-        mesh.order[following[plane]] = i
-        following[plane] += 1
+        plane, strip = mesh.corner[i, 0], mesh.corner[i, 1] // STRIP
+        mesh.order[following[plane, strip]] = i
+        following[plane, strip] += 1
 
 
 @chosen_by_type(inline=True, count_references=False)
@@ -361,25 +372,32 @@ def _spread_charges(arguments, block):
     low, high = mesh.bounds[0, block], mesh.bounds[0, block + 1]
     na, nb, nc = mesh.points[0], mesh.points[1], mesh.points[2]
     order = len(spline.nodes)
-    grid = mesh.grid
+    grid, flat = mesh.grid, mesh.flat
+    plane_size, row = mesh.strides[0], mesh.strides[1]
     weight = mesh.weight[block]
     grid[low:high] = 0
-    for before in range(min(high - low + order - 1, na)):
-        corner = low - order + 1 + before
+    for before in range(1 - order, min(high - low, na + 1 - order)):
+        corner = low + before
         corner += na if corner < 0 else 0
+        # the planes of these sites that are in the block
+        first, end = max(0, -before), min(order, high - low - before)
+        if high - low == na:
+            first, end = 0, order
         for n in range(mesh.first[corner], mesh.first[corner + 1]):
-            i = mesh.order[n]
-            store(weight, 0, weights_at(spline, mesh.offset[i, 0]))
-            store(weight, 8, weights_at(spline, mesh.offset[i, 1]))
-            z = weights_at(spline, mesh.offset[i, 2]) * mesh.offset[i, 3]
-            b, c = mesh.corner[i, 1], mesh.corner[i, 2]
-            for j in range(order):
+            i = np.uint64(mesh.order[n])
+            offset, cell = mesh.offset[i], mesh.corner[i]
+            store(weight, 0, weights_at(spline, offset[0]))
+            store(weight, 8, weights_at(spline, offset[1]))
+            z = weights_at(spline, offset[2]) * offset[3]
+            at = cell[1] * row + cell[2]
+            for j in range(first, end):
                 plane = corner + j
                 plane -= na if plane >= na else 0
-                if low <= plane < high:
-                    for k in range(order):
-                        row = grid[plane, b + k]
-                        store(row, c, load_vector(spline, row, c) + z * (weight[j] * weight[8 + k]))
+                begin = plane * plane_size + at
+                charge = z * weight[np.uint64(j)]
+                for k in range(order):
+                    here = begin + k * row
+                    store(flat, here, load_vector(spline, flat, here) + charge * weight[8 + k])
     for plane in range(low, high):
         for k in range(order - 1):
             for c in range(nc + order - 1):
@@ -449,33 +467,36 @@ def _interpolate_forces(arguments, block):
     _smooth, charge, spline, mesh = load_arguments(arguments)
     na = mesh.points[0]
     order = len(spline.nodes)
-    grid = mesh.grid
+    flat = mesh.flat
+    plane_size, row = mesh.strides[0], mesh.strides[1]
     weight = mesh.weight[block]
     for n in range(mesh.bounds[2, block], mesh.bounds[2, block + 1]):
-        i = mesh.order[n]
-        store(weight, 0, weights_at(spline, mesh.offset[i, 0]))
-        store(weight, 8, weights_at(spline, mesh.offset[i, 1]))
-        store(weight, 16, slopes_at(spline, mesh.offset[i, 0]))
-        store(weight, 24, slopes_at(spline, mesh.offset[i, 1]))
-        z = weights_at(spline, mesh.offset[i, 2])
-        dz = slopes_at(spline, mesh.offset[i, 2])
-        a, b, c = mesh.corner[i, 0], mesh.corner[i, 1], mesh.corner[i, 2]
+        i = np.uint64(mesh.order[n])
+        offset, cell = mesh.offset[i], mesh.corner[i]
+        store(weight, 0, weights_at(spline, offset[0]))
+        store(weight, 8, weights_at(spline, offset[1]))
+        store(weight, 16, slopes_at(spline, offset[0]))
+        store(weight, 24, slopes_at(spline, offset[1]))
+        z = weights_at(spline, offset[2])
+        dz = slopes_at(spline, offset[2])
+        at = cell[1] * row + cell[2]
         nothing = z * 0.0
         along_a = nothing
         along_b = nothing
         along_c = nothing
         for j in range(order):
-            plane = a + j
+            plane = cell[0] + j
             plane -= na if plane >= na else 0
-            flat = nothing
+            begin = plane * plane_size + at
+            even = nothing
             tilted = nothing
             for k in range(order):
-                row = load_vector(spline, grid[plane, b + k], c)
-                flat = flat + row * weight[8 + k]
-                tilted = tilted + row * weight[24 + k]
-            along_a = along_a + flat * weight[16 + j]
+                potential = load_vector(spline, flat, begin + k * row)
+                even = even + potential * weight[8 + k]
+                tilted = tilted + potential * weight[24 + k]
+            along_a = along_a + even * weight[16 + j]
             along_b = along_b + tilted * weight[j]
-            along_c = along_c + flat * weight[j]
+            along_c = along_c + even * weight[j]
         ga = -charge[i] * mesh.points[0] * sum_lanes(along_a * z) * (0.5 / pi)
         gb = -charge[i] * mesh.points[1] * sum_lanes(along_b * z) * (0.5 / pi)
         gc = -charge[i] * mesh.points[2] * sum_lanes(along_c * dz) * (0.5 / pi)

@@ -51,10 +51,11 @@ from rigidmd.forces.neighbors.sites import (
     BodySites,
     CentralSites,
     InSlots,
-    load_passes,
+    load_pass,
+    sum_passes,
     virial_buffer,
 )
-from rigidmd.forces.neighbors.update import list_code, refill, update_pair_list
+from rigidmd.forces.neighbors.update import list_code, list_passes, refill
 from rigidmd.forces.terms import (
     FORCES_ONLY,
     TALLIED,
@@ -62,6 +63,7 @@ from rigidmd.forces.terms import (
     WITH_VIRIALS,
     Evaluation,
     Setup,
+    TermPasses,
     trait,
 )
 
@@ -120,17 +122,6 @@ class PairWorkspace(NamedTuple):
     list_code: Code | None = None
 
     @property
-    def scratch(self) -> np.ndarray:
-        """The array that is used only while forces are computed."""
-        return self.sums.forces_behind
-
-    def with_scratch(self, arrays: np.ndarray) -> "PairWorkspace":
-        """With this array of the same type, which may be larger, as scratch."""
-        forces_behind = self.sums.forces_behind
-        forces_behind = arrays.reshape(-1)[: forces_behind.size].reshape(forces_behind.shape)
-        return self._replace(sums=self.sums._replace(forces_behind=forces_behind))
-
-    @property
     def site_force(self) -> np.ndarray:
         """Forces (s, 3) on its sites as last evaluated, lab frame, u Å/ps²."""
         return self.forces_in_slots.of_sites()
@@ -143,7 +134,7 @@ class PairWorkspace(NamedTuple):
     def with_code(self) -> "PairWorkspace":
         return self._replace(list_code=list_code(self.pairs, self.sites))
 
-    def passes(self, into: Evaluation) -> list[Pass]:
+    def passes(self, into: Evaluation) -> TermPasses:
         """Update of the list. Forces of rows, with what else is needed. Their sums on sites and
         molecules."""
         pairs = self.pairs
@@ -152,13 +143,10 @@ class PairWorkspace(NamedTuple):
         tallies = self.sums.tallies
         blocks = len(tallies)
         content = (self.slot_potential, pairs, sums)
-        moved = (self.list_code, pairs, sites, into.state, into.status)
         numbers = (self.potential, self.slot_potential, pairs, sums, into.status)
-        passes = [
-            Pass("update the neighbour list", update_pair_list, moved),
-            Pass("numbers of sites in its order, if it is new", _arrange_numbers, numbers),
-            Pass("forces of pairs", _sum_forces, (*content, None, None), blocks, FORCES_ONLY),
-        ]
+        of_list = list_passes(pairs, self.list_code, sites, into)
+        arrange = Pass("numbers of sites in its order, if it is new", _arrange_numbers, numbers)
+        passes = [Pass("forces of pairs", _sum_forces, (*content, None, None), blocks, FORCES_ONLY)]
         energies = (*content, tallies, tallies)
         virials = (*content, tallies, None)
         when = WITH_ENERGIES if self.needs_virials else TALLIED
@@ -171,7 +159,12 @@ class PairWorkspace(NamedTuple):
             Pass("sum forces on sites", _gather_forces, (pairs, sums, None), blocks, FORCES_ONLY),
             Pass("sum forces on sites", _gather_forces, (pairs, sums, tallies), blocks, TALLIED),
         ]
-        return passes + load_passes(sites, into, self.forces_in_slots, sums)
+        of_sums = sum_passes(sites, into, self.forces_in_slots, sums)
+        return of_list._replace(
+            lists=[*of_list.lists, arrange],
+            forces=passes + of_sums,
+            loads=[load_pass(sites, into, self.forces_in_slots)],
+        )
 
     def with_capacity(self, cell: np.ndarray) -> "PairWorkspace":
         """With the capacity that the last build of the list needed."""

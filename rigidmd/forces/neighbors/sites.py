@@ -328,19 +328,25 @@ class SumsOfBlocks(Protocol):
     def virial(self) -> np.ndarray: ...  # see `virial_buffer`
 
 
-def load_passes(
+def load_pass(
+    sites: BodySites | CentralSites, into: Evaluation, force: np.ndarray | InSlots
+) -> Pass:
+    """The pass that adds site forces (s, 3) to the load."""
+    content = sites, into.state, into.load, force
+    blocks = blocks_of(len(into.state.position))
+    return Pass("forces and torques on molecules", _load_block, content, blocks)
+
+
+def sum_passes(
     sites: BodySites | CentralSites,
     into: Evaluation,
     force: np.ndarray | InSlots,
     sums: SumsOfBlocks,
 ) -> list[Pass]:
-    """The passes that add site forces (s, 3) to the load, and the sums of blocks to the tally."""
-    state, load, tally = into.state, into.load, into.tally
+    """The passes that add the sums of blocks to the tally, with the site forces (s, 3)."""
+    state, tally = into.state, into.tally
     blocks = blocks_of(len(state.position))
-    passes = [
-        Pass("forces and torques on molecules", _load_block, (sites, state, load, force), blocks),
-        Pass("sum energies and virials", sum_tallies, (sums.tallies, tally), when=TALLIED),
-    ]
+    passes = [Pass("sum energies and virials", sum_tallies, (sums.tallies, tally), when=TALLIED)]
     if isinstance(sites, BodySites):
         offsets = (sites, state, force, sums.virial)
         virial = (sums.virial[:blocks], tally)

@@ -3,7 +3,7 @@ valid any longer."""
 
 from math import ceil, floor, inf, sqrt
 
-from rigidmd.compile import Code, call_blocks, kernel, load_arguments, pack_arguments, task
+from rigidmd.compile import Code, Pass, call_blocks, kernel, load_arguments, pack_arguments, task
 from rigidmd.core.state import CELL_CHANGED, EXAMPLE, LIST_FULL, NOT_FINITE, NOW, OK
 from rigidmd.forces.neighbors.clusters import (
     BUILT,
@@ -35,7 +35,7 @@ from rigidmd.forces.neighbors.rows import fill_rows, update_origin_vectors
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
 from rigidmd.forces.neighbors.space import follow_cell
 from rigidmd.forces.neighbors.tree import fit_boxes
-from rigidmd.forces.terms import copy
+from rigidmd.forces.terms import Evaluation, TermPasses, copy
 
 #: A list is built for positions predicted ahead by this fraction of the lifetime of the last list.
 #: With a larger one sites are farther from the predictions on average, and the loop has to work
@@ -59,30 +59,51 @@ def list_code(pairs: PairList, sites: BodySites | CentralSites) -> Code:
     )
 
 
+def list_passes(
+    pairs: PairList, code: Code | None, sites: BodySites | CentralSites, into: Evaluation
+) -> TermPasses:
+    """The passes that move the clusters with the cell and the molecules, and build the list if it
+    is not valid."""
+    blocks, of_state = len(pairs.needed), (pairs, sites, into.state)
+    moved = code, pairs, into.state, into.status
+    build = code, *of_state, into.status
+    return TermPasses(
+        cell=[Pass("images of the neighbour list, if the cell has changed", _move_list, moved)],
+        positions=[
+            Pass("positions of sites", set_local, of_state, blocks),
+            Pass("their displacements", measure_displacements, pairs, blocks),
+        ],
+        lists=[Pass("build the neighbour list, if it is not valid", build_if_invalid, build)],
+    )
+
+
+@task(count_references=False)
+def _move_list(arguments, block):
+    """Move the images of a list with the cell. A status code."""
+    code, pairs, state, status = load_arguments(arguments)
+    if not follow_cell(state.cell, pairs.cell):
+        return
+    for k in range(9):
+        # NaN, which comparisons do not detect
+        if pairs.cell[k // 3, k % 3] != pairs.cell[k // 3, k % 3]:
+            pairs.counters[USABLE] = 0
+            pairs.counters[STATUS] = status[0] = NOT_FINITE
+            return
+    if pairs.counters[USABLE] == 1:
+        if _move_images(pairs):
+            call_blocks(code, "origin_vectors", pack_arguments(pairs), len(pairs.needed))
+        else:
+            pairs.counters[USABLE] = 0
+
+
 @kernel(count_references=False)
-def update_list(pairs, code, sites, state):
-    """Move the clusters with the molecules, and rebuild the list if it is not valid. A status
-    code."""
+def build_list(pairs, code, sites, state):
+    """Build the list, unless it is valid for the present positions. A status code."""
+    if pairs.counters[USABLE] == 1 and largest_displacement(pairs) < inf:
+        return OK
     blocks = len(pairs.needed)
     arguments = pack_arguments(pairs)
     site_arguments = pack_arguments((pairs, sites, state))
-    if follow_cell(state.cell, pairs.cell):
-        for k in range(9):
-            if (
-                pairs.cell[k // 3, k % 3] != pairs.cell[k // 3, k % 3]
-            ):  # NaN, which comparisons do not detect
-                pairs.counters[USABLE] = 0
-                return NOT_FINITE
-        if pairs.counters[USABLE] == 1:
-            if _move_images(pairs):
-                call_blocks(code, "origin_vectors", arguments, blocks)
-            else:
-                pairs.counters[USABLE] = 0
-    if pairs.counters[USABLE] == 1:
-        call_blocks(code, "local", site_arguments, blocks)
-        call_blocks(code, "displacements", arguments, blocks)
-        if largest_displacement(pairs) < inf:
-            return OK
     pairs.counters[USABLE] = 0
     if not _cell_fits(pairs):
         return CELL_CHANGED
@@ -114,10 +135,10 @@ def update_list(pairs, code, sites, state):
 
 
 @task()
-def update_pair_list(arguments, block):
-    """`update_list`, with its status code."""
+def build_if_invalid(arguments, block):
+    """`build_list`, with its status code."""
     code, pairs, sites, state, status = load_arguments(arguments)
-    pairs.counters[STATUS] = status[0] = update_list(pairs, code, sites, state)
+    pairs.counters[STATUS] = status[0] = build_list(pairs, code, sites, state)
 
 
 @kernel(count_references=False)

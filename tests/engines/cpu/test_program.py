@@ -1,20 +1,35 @@
 """The step as a table of passes: what is compiled for which part of a scene, and how the table is
 printed."""
 
+import re
+import time
+
 import numpy as np
 import pytest
-from support.common import ROOT, built, small_scene
+from support.common import ROOT, built, same_bits, small_scene
 
 from rigidmd.assemble.build import build, integrator_of_stage
 from rigidmd.commands.cli import main
-from rigidmd.compile import ALWAYS, Pass, Program, kernel, load_arguments, run_passes, task
+from rigidmd.compile import (
+    ALWAYS,
+    JOINED,
+    Pass,
+    Program,
+    kernel,
+    load_arguments,
+    run_passes,
+    set_threads,
+    task,
+)
+from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.dynamics import step_loop
-from rigidmd.engines.cpu.program import program_of_forces, program_of_step
+from rigidmd.engines.cpu.program import profile_of, program_of_forces, program_of_step
 from rigidmd.forces.neighbors import update
 from rigidmd.io.scene_file import write_scene
 from rigidmd.run import Simulation
 
 EARLY, LATE = 1, 2
+PME = {"cutoff_A": 6.0, "electrostatics": "pme"}
 
 
 @task()
@@ -92,14 +107,14 @@ def test_the_step_loop_is_compiled_once_for_all_thermostats_barostats_and_forces
         Simulation(small_scene(counts, 14.0, stages=[stage], forces=forces), warn=str).run()
 
     run(STAGE)
-    loops, updates = len(step_loop._advance.compiled), len(update.update_pair_list.compiled)
+    loops, updates = len(step_loop._advance.compiled), len(update.build_if_invalid.compiled)
     for thermostat in ("langevin", "nose_hoover", "hybrid_monte_carlo"):
         run(STAGE | {"thermostat": thermostat})
     for barostat in ("cell_rescaling", "monte_carlo"):
         run(PRESSED | {"barostat": barostat})
     run({"ensemble": "nve", "duration_ps": 0.002}, truncation="force_shift")
     assert len(step_loop._advance.compiled) == loops
-    assert len(update.update_pair_list.compiled) == updates
+    assert len(update.build_if_invalid.compiled) == updates
 
 
 def test_a_stage_without_a_thermostat_has_no_flow_of_one():
@@ -114,11 +129,44 @@ def test_a_stage_without_a_thermostat_has_no_flow_of_one():
     assert not any("thermostat" in text for text in texts[1])
 
 
-def test_the_program_of_the_forces_is_in_the_order_of_the_terms():
-    _, engine, state = built({"spce": 4, "argon": 3}, 14.0, forces={"cutoff_A": 5.0})
+def test_the_program_of_the_forces_is_in_the_order_in_which_it_runs():
+    _, engine, state = built({"spce": 150}, 17.0, forces=PME)
     rows = program_of_forces(engine, state)
-    assert rows[0].text.startswith("lennard_jones: ")
+    assert rows[0].text.startswith("lennard_jones: images of the neighbour list")
     assert {"with energies", "without energies", ""} == {row.when for row in rows}
+    order = [row.text for row in rows]
+    steps = [
+        "coulomb_reciprocal: positions in grid cells",
+        "coulomb_real: positions of sites",
+        "lennard_jones: positions of sites",
+        "lennard_jones: build the neighbour list, if it is not valid",
+        "coulomb_reciprocal: charges on the grid, transform of planes",
+        "coulomb_real: forces of pairs",
+        "lennard_jones: forces of pairs",
+        "lennard_jones: forces and torques on molecules",
+        "coulomb_reciprocal: forces and torques on molecules",
+    ]
+    assert sorted(steps, key=order.index) == steps
+
+
+def test_forces_of_terms_are_one_job_and_few_molecules_need_none():
+    """Chains of terms run at the same time, and sums on molecules block by block."""
+    for molecules, edge, jobs in ((150, 17.0, 3), (60, 13.0, 2)):
+        _, engine, state = built({"spce": molecules}, edge, forces=PME)
+        passes = engine.passes(state)
+        assert len({one.job for _, one in passes}) == jobs + 1
+        chains = [
+            (name, one.chain)
+            for name, one in passes
+            if one.text in ("forces of pairs", "forces on sites")
+        ]
+        assert len({chain for _, chain in chains}) == 3
+        assert {one.chain for _, one in passes if "on molecules" in one.text} == (
+            {JOINED} if molecules > 128 else {0}
+        )
+        assert all(
+            one.job == 0 for _, one in passes if "list" in one.text or "cell has" in one.text
+        )
 
 
 def test_check_prints_the_program_of_each_stage(tmp_path, printed, monkeypatch):
@@ -128,7 +176,7 @@ def test_check_prints_the_program_of_each_stage(tmp_path, printed, monkeypatch):
     assert "program of a step of stages.1 (equilibration, baoab)" in out
     assert "program of a step of stages.2 (production, velocity_verlet)" in out
     assert "stages.0" not in out.partition("program of a step")[2]
-    assert "lennard_jones: update the neighbour list" in out
+    assert "lennard_jones: build the neighbour list" in out
     assert main(["new", "heavy_top_1"]) == 0
     assert (
         "--program is for molecules"
@@ -136,26 +184,93 @@ def test_check_prints_the_program_of_each_stage(tmp_path, printed, monkeypatch):
     )
 
 
-def test_check_measures_the_rows_of_a_step(tmp_path, printed):
-    scene = small_scene(
-        {"spce": 30, "argon": 5},
-        14.0,
-        forces={"cutoff_A": 5.0},
+def measured_scene():
+    return small_scene(
+        {"spce": 150, "argon": 5},
+        17.0,
+        forces={"cutoff_A": 6.0},
         stages=[STAGE | {"timestep_fs": 0.5}],
     )
-    write_scene(tmp_path, scene)
-    lines = (
-        printed("check", tmp_path / "scene.toml", "--profile")
-        .out.partition("time of a step of stages.0")[2]
-        .splitlines()
-    )
-    rows = [" ".join(line.split()[:-2]) for line in lines[2:] if line.endswith("%")]
-    system, engine = build(scene), build(scene).engine()
-    program = program_of_forces(engine, system.state)
-    assert rows[:-1] == [row.text for row in program if row.when != "with energies"]
-    times = [float(line.split()[-2]) for line in lines[2:] if line.endswith("%")]
-    assert len(times) > 5
-    assert all(spent >= 0 for spent in times)
+
+
+@pytest.mark.parametrize("threads", [1, min(2, MOST_THREADS)])
+def test_a_profile_has_the_times_of_all_rows_of_a_step(threads):
+    system = build(measured_scene())
+    engine = system.engine()
+    engine.threads = threads
+    scheme = integrator_of_stage(system, 0)
+    numbers, steps, rows, idle = profile_of(engine, system.state, scheme, 5e-4)
+    assert numbers == tuple(dict.fromkeys((1, threads)))
+    texts = [text for text, _ in rows]
+    forces = program_of_forces(engine, system.state)
+    assert set(texts) >= {row.text for row in forces if row.when != "with energies"}
+    assert not set(texts) & {row.text for row in forces if row.when == "with energies"} - {
+        row.text for row in forces if row.when != "with energies"
+    }
+    moves = [row.text for row in program_of_step(engine, system.state, scheme)]
+    assert set(texts) >= {text for text in moves if "drift" in text or "thermostat" in text}
+    assert "forces" not in texts
+    alone = sum(times[0] for _, times in rows[:-1])
+    assert 0.6 * steps[0] < alone < steps[0]  # the rest is between the rows
+    assert all(spent > 0 for _, times in rows[:-1] for spent in times)
+    assert 0 <= idle < 1
+
+
+def test_measuring_changes_no_bits():
+    system = build(measured_scene())
+    scheme = integrator_of_stage(system, 0)
+    found = []
+    for is_measured in (False, True):
+        engine = system.engine()
+        state = engine.begin(system.state, scheme)
+        engine.advance(state, scheme, 5e-4, 2)
+        rows = engine.measure(state) if is_measured else []
+        engine.advance(state, scheme, 5e-4, 30)
+        assert all(
+            spent.any() for text, _, spent in rows if text == "coulomb_real: forces of pairs"
+        )
+        found.append(state)
+    assert same_bits(*found)
+
+
+@task()
+def _work(arguments, block):
+    total, count = load_arguments(arguments)
+    for n in range(count):
+        total[block] += np.sqrt(n + block)
+
+
+def test_the_time_of_blocks_is_measured():
+    status, total = np.zeros(1, np.int64), np.zeros(6)
+    passes = [Pass("much", _work, (total, 400_000), 6), Pass("little", _work, (total, 100_000), 6)]
+    program = Program(passes, ALWAYS, status)
+    program.bind(passes)
+    spent = program.measure()
+    set_threads(1)
+    began = time.perf_counter_ns()
+    assert run_rows(program.rows, ALWAYS) == 0
+    whole = time.perf_counter_ns() - began
+    set_threads(MOST_THREADS)
+    much, little = spent[..., 0].sum(axis=1)
+    assert (spent[:, :6, 0] > 0).all() and not spent[:, 6:].any() and not spent[..., 1:].any()
+    assert 0.5 * whole < much + little < whole
+    assert much > 2 * little
+    program.bind(passes)  # as when arrays have been enlarged
+    run_rows(program.rows, ALWAYS)
+    assert spent[0, :, 0].sum() > 1.5 * much
+
+
+def test_check_prints_a_profile(tmp_path, printed):
+    write_scene(tmp_path, measured_scene())
+    out = printed("check", tmp_path / "scene.toml", "--profile").out
+    lines = out.partition("time of a step of stages.0")[2].splitlines()
+    table = [re.split(r"\s{2,}", line.strip()) for line in lines[1:]]
+    assert table[0] == ["time, µs", "1 thread", f"{MOST_THREADS} threads", "gain", "of a step"]
+    assert table[-2][0] == "a step" and table[-2][-1] == "100.0%"
+    assert table[-1][0].startswith("idle: ")
+    alone, together, gain = map(float, table[-2][1:4])
+    assert gain == pytest.approx(alone / together, abs=0.006)
+    assert sum(float(row[2]) for row in table[1:-2]) == pytest.approx(together, abs=3)
 
 
 def test_check_measures_a_potential_of_bodies(printed):

@@ -11,6 +11,7 @@ from support.ewald import TIGHT_EWALD, TIGHT_PME, salty
 from rigidmd.core.statistics import slope
 from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.forces.ewald.direct_sum import ewald_sum_in_numpy, k_vectors_up_to
+from rigidmd.forces.neighbors.sites import compute_site_positions
 from rigidmd.forces.neighbors.space import Triclinic, cell_of
 from rigidmd.run import Every, Simulation
 from rigidmd.run.force_errors import coulomb_errors
@@ -33,7 +34,8 @@ def test_the_reciprocal_sum_of_a_triclinic_cell():
         state.cell[:] = cell_of(triclinic)
         _, tallies = engine.evaluate(state)
         own = engine.workspaces["reciprocal"]
-        position = (own.sums if method is TIGHT_EWALD else own.mesh).position
+        position = np.empty((len(term.charge), 3))
+        compute_site_positions(term.sites, state, position)
         found[method["electrostatics"]] = (
             tallies["reciprocal"].energy,
             own.site_force.copy(),

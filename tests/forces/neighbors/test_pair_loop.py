@@ -10,17 +10,6 @@ from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.forces.terms import WITH_ENERGIES, TermDispatcher
 
 
-def test_sums_that_only_a_passing_moment_needs_are_in_common():
-    _, engine, state = built(
-        {"spce": 200}, 18.5, 4, forces={"cutoff_A": 8.0}
-    )  # this many that there are blocks
-    engine.evaluate(state)
-    one, two = engine.workspaces.values()
-    assert one.sums.forces_behind.size != two.sums.forces_behind.size
-    assert np.shares_memory(one.sums.forces_behind, two.sums.forces_behind)
-    assert not np.shares_memory(one.sums.forces, two.sums.forces)
-
-
 @pytest.mark.parametrize("field", ["position", "velocity", "rotation", "step"])
 def test_code_is_not_run_on_arrays_that_it_was_not_compiled_for(field):
     """Five argon atoms without forces and with `position` in Fortran's order once went astray
@@ -39,5 +28,5 @@ def test_an_address_is_held_to_the_type_it_was_compiled_for():
     own = engine.workspaces["lennard_jones"]
     sites = own.sites._replace(first=own.sites.first.astype(np.int64))
     loading = TermDispatcher((own,), WITH_ENERGIES)
-    with pytest.raises(TypeError, match="update_pair_list was compiled for task_arguments"):
+    with pytest.raises(TypeError, match="set_local was compiled for task_arguments"):
         loading.bind((own._replace(sites=sites),), state, no_load(state))

@@ -28,8 +28,8 @@ from rigidmd.forces.neighbors.sites import (
     molecules_of_block,
     sum_tallies,
 )
-from rigidmd.forces.neighbors.update import update_pair_list
-from rigidmd.forces.terms import FORCES_ONLY, TALLIED, Evaluation, Setup
+from rigidmd.forces.neighbors.update import list_passes
+from rigidmd.forces.terms import FORCES_ONLY, TALLIED, Evaluation, Setup, TermPasses
 from rigidmd.mechanics.vectors import body_vector, lab_vector
 
 #: The skin is at most this fraction of the cutoff.
@@ -84,21 +84,26 @@ class BodyPairsWorkspace(NamedTuple):
     near: PairWorkspace  # its list of the reference points
     sums: BodySums
 
-    def passes(self, into: Evaluation) -> list[Pass]:
+    def passes(self, into: Evaluation) -> TermPasses:
         """Poses; the list; pairs; sums on bodies."""
         term, near, sums, state = self.term, self.near, self.sums, into.state
         blocks = blocks_of(len(term.kind))
-        moved = (near.list_code, near.pairs, near.sites, state, into.status)
+        of_list = list_passes(near.pairs, near.list_code, near.sites, into)
+        poses = Pass("poses of bodies", _place_bodies, (term, sums, state), blocks)
         plain = (term, near.pairs, sums, None)
         tallied = (term, near.pairs, sums, sums.tallies)
-        return [
-            Pass("poses of bodies", _place_bodies, (term, sums, state), blocks),
-            Pass("update the neighbour list", update_pair_list, moved),
-            Pass("forces of pairs of bodies", _add_pairs, plain, BLOCKS, FORCES_ONLY),
-            Pass("forces and energies of pairs of bodies", _add_pairs, tallied, BLOCKS, TALLIED),
-            Pass("sum forces on bodies", _sum_loads, (term, sums, state, into.load), blocks),
-            Pass("sum energies", sum_tallies, (sums.tallies, into.tally), when=TALLIED),
-        ]
+        with_energies = "forces and energies of pairs of bodies"
+        return of_list._replace(
+            positions=[poses, *of_list.positions],
+            forces=[
+                Pass("forces of pairs of bodies", _add_pairs, plain, BLOCKS, FORCES_ONLY),
+                Pass(with_energies, _add_pairs, tallied, BLOCKS, TALLIED),
+                Pass("sum energies", sum_tallies, (sums.tallies, into.tally), when=TALLIED),
+            ],
+            loads=[
+                Pass("sum forces on bodies", _sum_loads, (term, sums, state, into.load), blocks)
+            ],
+        )
 
     def with_code(self) -> "BodyPairsWorkspace":
         return self._replace(near=self.near.with_code())
