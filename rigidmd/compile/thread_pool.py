@@ -68,7 +68,7 @@ ROWS_DONE = 5 * LINE
 # of each row, after its columns: ranges that are left; the last job in which it was done; for each
 # range, the last job in which a thread began it
 FIRST_ROW = 6 * LINE
-LEFT, DONE, BEGUN = LINE, 2 * LINE, 3 * LINE
+LEFT, DONE, BEGUN = LINE, LINE + 1, 2 * LINE
 ROW = BEGUN + MOST_RANGES
 # of each thread, the calling one first: 1 while it sleeps; the lock on which it sleeps
 FIRST_THREAD = FIRST_ROW + MOST_ROWS * ROW
@@ -322,7 +322,9 @@ def _run_job(pool, table, rows, status):
     for k in range(rows):
         row = FIRST_ROW + k * ROW
         for column in range(COLUMNS):
-            _write(pool, row + column, _read(table, k * COLUMNS + column))
+            # what is the same as before stays in the caches of all threads
+            if _read(pool, row + column) != _read(table, k * COLUMNS + column):
+                _write(pool, row + column, _read(table, k * COLUMNS + column))
         _write(pool, row + LEFT, min(_read(table, k * COLUMNS + BLOCKS), MOST_RANGES))
     _write(pool, ROWS, rows)
     _write(pool, STATUS, status)
