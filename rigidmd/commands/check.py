@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     flag("--program", help="also print the compiled passes of a time step, in order"),
     flag(
         "--profile",
-        help="also measure which fraction of a step each row of the forces takes, from the start",
+        help="also measure the rows of a step from the start, on one thread and on all",
     ),
 )
 def _check(options: Options) -> int:

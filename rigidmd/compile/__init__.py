@@ -19,6 +19,7 @@ from rigidmd.compile.code import (
 from rigidmd.compile.kernels import chosen_by_type, implements, is_a, kernel
 from rigidmd.compile.machine import BLOCKS, MOST_BLOCKS, SIMD_BITS
 from rigidmd.compile.program import (
+    ALONE,
     ALWAYS,
     JOINED,
     Pass,
@@ -27,7 +28,6 @@ from rigidmd.compile.program import (
     call_row,
     run_from,
     run_passes,
-    run_row,
 )
 from rigidmd.compile.records import NumbaStruct
 from rigidmd.compile.thread_pool import call_address, set_threads

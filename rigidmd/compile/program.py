@@ -135,14 +135,6 @@ class Program:
         return [one for one in passes if one.when & self._uses]
 
 
-@kernel(from_python=True)
-def run_row(rows, k):
-    """Call pass k; returns its status."""
-    rows.status[0] = 0
-    call_row(rows, rows.arguments, k)
-    return rows.status[0]
-
-
 @kernel
 def run_from(rows, when, row):
     """Call the passes from number row[0] on that act at `when`, bits. Returns the first status that

@@ -4,46 +4,39 @@ vector width.
     python tests/benchmarks/kernels.py --workloads W1,W2,W3 --bits 512,256,128
 
 The liquids are those of peers.py. A lane is one site of a vector that meets another site; it is
-useful if the two are inside the cutoff and act on one another. The parts of a step are the passes of
-its program (`rigidmd check --program`), called one by one in their order. Times are the shortest of
-many calls, since other programs can only add to them; a call from Python takes some 0.01 ms of each.
-A build of
-the neighbour list is divided by the number of steps between two. Each width runs in a process of its
-own, since it is chosen when the package is imported.
+useful if the two are inside the cutoff and act on one another. The parts of a step are those of
+`rigidmd check --profile`. Each width runs in a process of its own, since it is chosen when the
+package is imported.
 """
 
 import json
 import os
 import subprocess
 import sys
-import time
 from argparse import SUPPRESS
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from command_line import SMOKE, SMOKE_OPTION, choice, new_parser, numbers, read_options
+from command_line import SMOKE_OPTION, choice, new_parser, numbers, read_options
 from numba import njit
 from peers import WORKLOADS, start_folder
 from scipy.spatial import cKDTree
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from rigidmd import Scene, Simulation
-from rigidmd.compile import SIMD_BITS, Rows, run_row
+from rigidmd.compile import SIMD_BITS
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.state import State
-from rigidmd.engines.cpu.engine import DTYPES, CpuEngine
-from rigidmd.forces.neighbors.lists import BUILDS, MASKED, end_of_row, largest_displacement
+from rigidmd.engines.cpu.engine import DTYPES
+from rigidmd.engines.cpu.program import profile_of
+from rigidmd.forces.neighbors.lists import MASKED, end_of_row, largest_displacement
 from rigidmd.forces.neighbors.pair_loop import PairWorkspace
 from rigidmd.forces.neighbors.sites import compute_site_positions
-from rigidmd.forces.terms import FORCES_ONLY
 
 STEP = 2e-3  # ps
-#: Before anything is measured, so that lists are of a usual age; and of the rate of a whole step.
-STEPS = 10 if SMOKE else 100
-CALLS = 2 if SMOKE else 100  # of each part
+AGE = 8  # steps since the build of a list whose lanes are counted: a usual age
 TRUNCATIONS = ("shift", "switch", "smooth_switch")
-PAIRS, UPDATE = "forces of pairs", "update the neighbour list"  # texts of passes
+PAIRS = "forces of pairs"  # text of a pass
 
 
 @njit
@@ -59,13 +52,6 @@ def entries_that_matter(pairs):
             found += end_of_row(pairs, r, moved) - first
             first = pairs.row_end[r]
     return found
-
-
-def milliseconds(call, *arguments) -> float:
-    """The time of a call, ms."""
-    began = time.perf_counter()
-    call(*arguments)
-    return 1e3 * (time.perf_counter() - began)
 
 
 def useful_pairs(term: PairWorkspace, state: State) -> int:
@@ -85,21 +71,6 @@ def lanes_of(term: PairWorkspace) -> int:
     return int(rows) * 2 * 4 * len(pairs.clusters.order) // len(pairs.clusters.origin)
 
 
-class Part(NamedTuple):
-    """A pass of the forces, without energies."""
-
-    term: str
-    text: str
-    row: int
-
-
-def parts_of(engine: CpuEngine, state: State) -> list[Part]:
-    """The parts of the forces of a step."""
-    passes = [(name, one.text) for name, some in engine.passes(state).items() for one in some]
-    when = engine.rows_of_steps().when
-    return [Part(*passes[k], k) for k in range(len(when)) if when[k] & FORCES_ONLY]
-
-
 def measure(job: dict) -> dict:
     """Costs of pairs, and times of the parts of a step, of one workload, precision and truncation,
     in this process' vector width."""
@@ -108,55 +79,28 @@ def measure(job: dict) -> dict:
         work.scene(job["truncation"], precision=job["precision"]), start_folder(job["workload"])
     )
     simulation = Simulation(scene)
-    engine, state = simulation.engine, simulation.state.copy()
+    engine = simulation.engine
     engine.threads = 1
     scheme = SCHEMES["velocity_verlet"]
-    engine.advance(state, scheme, STEP, STEPS)
-    builds = builds_of(engine)
-    step = milliseconds(engine.advance, state, scheme, STEP, 2 * STEPS) / STEPS
-    builds = {name: number - builds[name] for name, number in builds_of(engine).items()}
-
-    rows, parts = engine.rows_of_steps(), parts_of(engine, state)
-    calls = [[milliseconds(run_row, rows, part.row) for part in parts] for _ in range(1 + CALLS)]
-    pairs, times = [], []
-    for part, spent in zip(parts, np.min(calls[1:], axis=0).tolist(), strict=True):
-        term = engine.workspaces[part.term]
-        times.append([f"{part.term}: {part.text}", spent])
-        if part.text == UPDATE:
-            build = shortest_build(term, rows, part.row)
-            every = STEPS / max(1, builds[part.term])
-            times.append([f"{part.term}: a build in {every:.0f} steps", build / every])
-        if part.text == PAIRS:
+    profile = profile_of(engine, simulation.state, scheme, STEP)
+    state = engine.begin(simulation.state, scheme)
+    engine.advance(state, scheme, STEP, AGE)
+    pairs, times = [], [(text, 1e3 * spent) for text, (spent,) in profile.rows]
+    for text, spent in times:
+        name, _, part = text.partition(": ")
+        if part == PAIRS:
+            term = engine.workspaces[name]
             lanes, useful = lanes_of(term), useful_pairs(term, state)
             pairs.append(
                 {
-                    "kernel": f"{part.term}, {type(term.slot_potential).__name__}",
+                    "kernel": f"{name}, {type(term.slot_potential).__name__}",
                     "per_pair": 1e6 * spent / useful,
                     "per_lane": 1e6 * spent / lanes,
                     "useful": useful / lanes,
                 }
             )
-    times.append(["kicks, drifts, and all else", max(0.0, step - sum(spent for _, spent in times))])
     lanes = SIMD_BITS // (8 * np.dtype(DTYPES[job["precision"]]).itemsize)
-    return {**job, "lanes": lanes, "step": step, "pairs": pairs, "times": times}
-
-
-def shortest_build(term: PairWorkspace, rows: Rows, k: int) -> float:
-    """The time of an update that builds the list, ms."""
-    taken = []
-    for _ in range(CALLS):
-        term.renew_list()
-        taken.append(milliseconds(run_row, rows, k))
-    return min(taken)
-
-
-def builds_of(engine: CpuEngine) -> dict[str, int]:
-    """Builds of neighbour lists so far, by term."""
-    return {
-        name: int(term.pairs.counters[BUILDS])
-        for name, term in engine.workspaces.items()
-        if isinstance(term, PairWorkspace)
-    }
+    return {**job, "lanes": lanes, "step": 1e3 * profile.steps[0], "pairs": pairs, "times": times}
 
 
 def run_job(workload: str, precision: str, truncation: str, bits: int) -> dict:

@@ -5,7 +5,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import Rows, compile_together, set_threads
+from rigidmd.compile import compile_together, set_threads
 from rigidmd.compile.kernels import CompileError
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme
@@ -189,10 +189,6 @@ class CpuEngine(CompiledEngine[Model, Advance]):
             return None
         extension, workspace = self._extension
         return extension.sums(workspace)
-
-    def rows_of_steps(self) -> Rows:
-        """The rows of the forces of steps, bound to the state that `advance` has moved last."""
-        return self._dispatchers["steps"].table.rows
 
     def measure(self, state: State) -> list[tuple[str, int, np.ndarray]]:
         """Measure the rows of steps from now on, without those of its forces as a whole.

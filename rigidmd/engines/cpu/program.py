@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.compile import ALONE, JOINED, Pass
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import State, no_load
@@ -20,19 +21,20 @@ class Row(NamedTuple):
 
     text: str
     blocks: int
+    job: str  # in words; empty if it runs alone
     when: str  # in words; empty if it acts always
 
 
 def program_of_step(engine: CpuEngine, state: State, scheme: Scheme) -> list[Row]:
     """The rows of a step of molecules, in order. Nothing is compiled."""
     table = StepTable(scheme, engine.step_parts(scheme, state, no_load(state)))
-    return [Row(one.text, one.blocks, table.words(one.when)) for one in table.passes]
+    return [Row(one.text, one.blocks, "", table.words(one.when)) for one in table.passes]
 
 
 def program_of_forces(engine: CpuEngine, state: State) -> list[Row]:
     """The rows of an evaluation of forces, in order. Nothing is compiled."""
     return [
-        Row(f"{name}: {one.text}", one.blocks, _when(one.when))
+        Row(f"{name}: {one.text}", one.blocks, _job(one), _when(one.when))
         for name, one in engine.passes(state)
     ]
 
@@ -114,6 +116,14 @@ def describe_profile(profile: Profile) -> str:
     return "\n".join(lines)
 
 
+def _job(one: Pass) -> str:
+    if one.job == ALONE:
+        return ""
+    return (
+        f"{one.job}, blocks joined" if one.chain == JOINED else f"{one.job}, chain {one.chain + 1}"
+    )
+
+
 def _when(bits: int) -> str:
     if bits & FORCES_ONLY and bits & WITH_ENERGIES:
         return ""
@@ -121,10 +131,12 @@ def _when(bits: int) -> str:
 
 
 def describe_program(rows: list[Row]) -> str:
-    """A table of the rows of a program."""
-    width = max(len(row.text) for row in rows)
+    """A table of the rows of a program. Chains of one job run at the same time."""
+    width, job_width = (
+        max(map(len, texts)) for texts in zip(*[(r.text, r.job) for r in rows], strict=True)
+    )
     lines = [
-        f"{k:>4}  {row.text:<{width}} {row.blocks:>6}  {row.when}".rstrip()
+        f"{k:>4}  {row.text:<{width}} {row.blocks:>6}  {row.job:<{job_width}}  {row.when}".rstrip()
         for k, row in enumerate(rows, 1)
     ]
-    return "\n".join([f"{'row':>4}  {'':<{width}} blocks  when", *lines])
+    return "\n".join([f"{'row':>4}  {'':<{width}} blocks  {'job':<{job_width}}  when", *lines])
