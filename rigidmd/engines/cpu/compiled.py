@@ -275,7 +275,7 @@ class CompiledEngine(Engine, Generic[ModelT, Bound]):
         load = no_load(state)
         status = np.zeros(1, np.int64)
         into = Evaluation(state, load, np.zeros(TALLY_SIZE), status)
-        workspaces = zip(self.names, self.new_workspaces(state), strict=False)
+        workspaces = zip(self.names or ["no forces"], self.new_workspaces(state), strict=True)
         return in_order([(name, trait(of, "passes")(into)) for name, of in workspaces])
 
     def new_workspaces(self, state: State) -> tuple[NamedTuple, ...]:

@@ -273,6 +273,13 @@ def test_check_prints_a_profile(tmp_path, printed):
     assert sum(float(row[2]) for row in table[1:-2]) == pytest.approx(together, abs=3)
 
 
+def test_an_ideal_gas_has_a_program_and_a_profile(tmp_path, printed):
+    scene = small_scene({"argon": 5}, 20.0, forces={"lennard_jones": False}, stages=[STAGE])
+    write_scene(tmp_path, scene)
+    out = printed("check", tmp_path / "scene.toml", "--program", "--profile").out
+    assert out.count("no forces: add forces ") == 3
+
+
 def test_check_measures_a_potential_of_bodies(printed):
     assert (
         "gay_berne: forces of pairs of bodies"
