@@ -33,7 +33,8 @@ ALWAYS = -1
 #: The job of a pass that runs when all before it are done, and which the next one waits for. Only
 #: such a pass may call blocks of other tasks on all threads.
 ALONE = 0
-#: The chain of passes with the same blocks, each of which follows the same block of the one before.
+#: A chain in which each block of a pass follows the same block of the pass before, if both have the
+#: same number of blocks.
 JOINED = -1
 
 
@@ -87,10 +88,10 @@ class Program:
         arguments, blocks, job, chain = np.zeros((4, len(used)), np.intp)
         table = np.zeros((len(used), COLUMNS), np.intp)
         self.rows = Rows(addresses, arguments, blocks, when, job, chain, table, status)
-        # arrays of addresses, with the arguments to which they belong
-        self._bound: dict[int, tuple[np.ndarray, list[NumbaStruct]]] = {}
+        # by array of addresses: the array, the arguments, and those of `measure_block`
+        self._bound: dict[int, tuple[np.ndarray, list[NumbaStruct], list[NumbaStruct]]] = {}
         self._spent: np.ndarray | None = None
-        self._unmeasured, self._watches = addresses, dict[int, list[NumbaStruct]]()
+        self._unmeasured = addresses
 
     def bind(self, passes: Sequence[Pass], arguments: np.ndarray | None = None) -> None:
         """Set the arguments of all passes, in `rows` or in another array of addresses (rows,).
@@ -110,25 +111,23 @@ class Program:
         self._set_arguments(target, structs)
 
     def _set_arguments(self, target: np.ndarray, structs: list[NumbaStruct]) -> None:
-        self._bound[id(target)] = target, structs
+        used = structs
         if self._spent is not None:
             rows = zip(self._unmeasured.tolist(), structs, self._spent, strict=True)
-            structs = [NumbaStruct((task, struct.address, spent)) for task, struct, spent in rows]
-            self._watches[id(target)] = structs
-        target[:] = [struct.address for struct in structs]
+            used = [NumbaStruct((task, struct.address, spent)) for task, struct, spent in rows]
+        self._bound[id(target)] = target, structs, used
+        target[:] = [struct.address for struct in used]
 
     def measure(self) -> np.ndarray:
         """Measure all blocks from now on. Returns the array (rows, blocks, 8) to whose [..., 0]
         their times are added, ns; threads write to different cache lines."""
-        count = len(self.rows.when)
-        self._spent, self._unmeasured = (
-            np.zeros((count, MOST_BLOCKS, 8), int),
-            self.rows.address.copy(),
-        )
-        kind = arguments_type((0, 0, np.zeros((MOST_BLOCKS, 8), int)))
-        self.rows.address[:] = addresses_of([(measure_block, kind)])
-        for target, structs in list(self._bound.values()):
-            self._set_arguments(target, structs)
+        if self._spent is None:
+            self._unmeasured = self.rows.address.copy()
+            self._spent = np.zeros((len(self._unmeasured), MOST_BLOCKS, 8), int)
+            kind = arguments_type((0, 0, np.zeros((MOST_BLOCKS, 8), int)))
+            self.rows.address[:] = addresses_of([(measure_block, kind)])
+            for target, structs, _ in list(self._bound.values()):
+                self._set_arguments(target, structs)
         return self._spent
 
     def _used(self, passes: Sequence[Pass]) -> list[Pass]:
@@ -172,9 +171,13 @@ def run_passes(rows, arguments, when):
             continue
         if rows.job[k] != job or count == MOST_ROWS:
             count = _run_collected(rows, count)
-        if rows.job[k] == ALONE and rows.status[0] == 0:
+            if rows.status[0] != 0:
+                return rows.status[0]
+        if rows.job[k] == ALONE:
             call_row(rows, arguments, k)
-        elif rows.job[k] != ALONE:
+            if rows.status[0] != 0:
+                return rows.status[0]
+        else:
             row = rows.table[count]
             row[0], row[1], row[2] = rows.address[k], arguments[k], rows.blocks[k]
             row[3] = AT_ONCE
@@ -182,8 +185,6 @@ def run_passes(rows, arguments, when):
                 has_same_blocks = row[2] == rows.table[count - 1, 2]
                 row[3] = WITH if chain == JOINED and has_same_blocks else AFTER
             count += 1
-        if rows.status[0] != 0:
-            return rows.status[0]
         job, chain = rows.job[k], rows.chain[k]
     _run_collected(rows, count)
     return rows.status[0]

@@ -160,6 +160,10 @@ def _pause(typing):
     return types.void(), emit
 
 
+def _as_integer(builder, content):
+    return content if isinstance(content.type, ir.IntType) else builder.ptrtoint(content, INT64)
+
+
 @intrinsic
 def call_address(typing, address, task_arguments, block):
     """Call the task at an address with a block and with arguments, or their address (a
@@ -167,27 +171,32 @@ def call_address(typing, address, task_arguments, block):
 
     def emit(context, builder, signature, arguments):
         address, content, block = arguments
-        if not isinstance(content.type, ir.IntType):
-            content = builder.ptrtoint(content, INT64)
         kind = ir.FunctionType(ir.VoidType(), [INT64, INT64])
-        builder.call(function_at(builder, address, kind), [content, block])
+        builder.call(function_at(builder, address, kind), [_as_integer(builder, content), block])
         return context.get_dummy_value()
 
     content = types.intp if isinstance(task_arguments, types.Integer) else task_arguments
     return types.void(types.intp, content, types.intp), emit
 
 
+@kernel(inline=True, count_references=False)
+def _end_of_group(table, columns, k, rows):
+    """The number of the first row after row k and those `WITH` it."""
+    k += 1
+    while k < rows and _read(table, k * columns + BEGINS) == WITH:
+        k += 1
+    return k
+
+
 @kernel(count_references=False)
-def _call_blocks_of_rows(table, columns, k, rows, status, first, end):
+def _call_group(table, columns, k, rows, status, first, end):
     """Call blocks first ... end - 1 of row k of a table, each with the same block of the rows
     `WITH` it, while the status is 0."""
+    end_of_group = _end_of_group(table, columns, k, rows)
     for block in range(first, end):
-        n = k
-        while n == k or (n < rows and _read(table, n * columns + BEGINS) == WITH):
+        for row in range(k * columns, end_of_group * columns, columns):
             if _read(status, 0) == 0:
-                row = n * columns
                 call_address(_read(table, row + ADDRESS), _read(table, row + ARGUMENTS), block)
-            n += 1
 
 
 @kernel(count_references=False)
@@ -214,7 +223,7 @@ def _run_ranges_of_row(pool, job, k, rows, thread, threads):
     """
     row = FIRST_ROW + k * ROW
     events, blocks = _read(pool, EVENTS), _read(pool, row + BLOCKS)
-    ranges = min(blocks, MOST_RANGES)
+    ranges = _ranges_of(blocks)
     step = 1 - 2 * (thread % 2)
     at = thread * ranges // threads
     if step < 0:
@@ -228,11 +237,15 @@ def _run_ranges_of_row(pool, job, k, rows, thread, threads):
         if at < 0:
             return count, False
         low, high = at * blocks // ranges, (at + 1) * blocks // ranges
-        table = pool + 8 * FIRST_ROW
-        _call_blocks_of_rows(table, ROW, k, rows, _read(pool, STATUS), low, high)
+        _call_group(pool + 8 * FIRST_ROW, ROW, k, rows, _read(pool, STATUS), low, high)
         count += 1
         if _read(pool, EVENTS) != events:
             return count, True
+
+
+@kernel(inline=True, count_references=False)
+def _ranges_of(blocks):
+    return max(1, min(blocks, MOST_RANGES))  # one without blocks ends a row that has none
 
 
 @kernel(count_references=False)
@@ -246,39 +259,57 @@ def _run_ranges(pool, thread):
     k = first = 0  # the rows before `first` have no range left
     while k < rows and _read(pool, JOB) == job:
         row = FIRST_ROW + k * ROW
-        begins = _read(pool, row + BEGINS)
-        count, is_left = 0, begins != WITH
-        if begins == AT_ONCE or (begins == AFTER and _read(pool, row - ROW + DONE) == job):
+        end = _end_of_group(pool + 8 * FIRST_ROW, ROW, k, rows)
+        count, is_left = 0, True
+        if _read(pool, row + BEGINS) == AT_ONCE or _read(pool, row - ROW + DONE) == job:
             count, is_left = _run_ranges_of_row(pool, job, k, rows, thread, threads)
         if k == first and not is_left:
-            first += 1
+            first = end
+        k = end
         if count > 0:
             has_run = True
             if _add(pool, row + LEFT, -count) == count:
-                _finish_row(pool, job, k, rows)
-        k = first if count > 0 else k + 1
+                _finish_group(pool, job, row, end, rows)
+            k = first
     return has_run
 
 
 @kernel(count_references=False)
-def _finish_row(pool, job, k, rows):
-    """Row k is done, and the rows `WITH` it."""
-    n = k
-    while n == k or (n < rows and _read(pool, FIRST_ROW + n * ROW + BEGINS) == WITH):
-        _write(pool, FIRST_ROW + n * ROW + DONE, job)
-        n += 1
-    _add(pool, ROWS_DONE, n - k)
-    _announce(pool)
+def _finish_group(pool, job, row, end, rows):
+    """Rows up to number end - 1 are done, from the one in cell `row` on."""
+    count = 0
+    for cell in range(row, FIRST_ROW + end * ROW, ROW):
+        _write(pool, cell + DONE, job)
+        count += 1
+    is_last = _add(pool, ROWS_DONE, count) + count == rows
+    following = FIRST_ROW + end * ROW
+    if end < rows and _read(pool, following + BEGINS) == AFTER:
+        _announce(pool, _ranges_of(_read(pool, following + BLOCKS)) - 1)
+    else:
+        _announce(pool, 0)
+    if is_last:
+        _wake_if_asleep(pool, 0)
 
 
 @kernel(count_references=False)
-def _announce(pool):
-    """Let waiting threads see that there may be something to do."""
+def _announce(pool, wanted):
+    """Let waiting threads see that there may be something to do, and wake at most `wanted` that
+    sleep."""
     _add(pool, EVENTS, 1)
     for thread in range(_read(pool, THREADS)):
-        line = FIRST_THREAD + LINE * thread
-        if _read(pool, line + SLEEPS) == 1 and _replace(pool, line + SLEEPS, 1, 0):
-            _wake(_read(pool, line + LOCK))
+        if wanted <= 0:
+            break
+        wanted -= _wake_if_asleep(pool, thread)
+
+
+@kernel(count_references=False)
+def _wake_if_asleep(pool, thread):
+    """Wake a thread; returns the number of threads that slept."""
+    line = FIRST_THREAD + LINE * thread
+    if _read(pool, line + SLEEPS) == 0 or not _replace(pool, line + SLEEPS, 1, 0):
+        return 0
+    _wake(_read(pool, line + LOCK))
+    return 1
 
 
 @kernel(count_references=False)
@@ -315,22 +346,25 @@ def _run_job(pool, table, rows, status):
         for k in range(rows):
             row = k * COLUMNS
             if _read(table, row + BEGINS) != WITH:
-                _call_blocks_of_rows(table, COLUMNS, k, rows, status, 0, _read(table, row + BLOCKS))
+                _call_group(table, COLUMNS, k, rows, status, 0, _read(table, row + BLOCKS))
         return
     job = (_read(pool, JOB) // 2 + 1) * 2
     _write(pool, JOB, job - 1)
+    ready = 0  # ranges
     for k in range(rows):
         row = FIRST_ROW + k * ROW
         for column in range(COLUMNS):
             # what is the same as before stays in the caches of all threads
             if _read(pool, row + column) != _read(table, k * COLUMNS + column):
                 _write(pool, row + column, _read(table, k * COLUMNS + column))
-        _write(pool, row + LEFT, min(_read(table, k * COLUMNS + BLOCKS), MOST_RANGES))
+        ranges = _ranges_of(_read(table, k * COLUMNS + BLOCKS))
+        _write(pool, row + LEFT, ranges)
+        ready += ranges if _read(table, k * COLUMNS + BEGINS) == AT_ONCE else 0
     _write(pool, ROWS, rows)
     _write(pool, STATUS, status)
     _write(pool, ROWS_DONE, 0)
     _write(pool, JOB, job)
-    _announce(pool)
+    _announce(pool, ready - 1)
     polls = 0
     while True:
         events = _read(pool, EVENTS)
@@ -383,11 +417,10 @@ def run_on_all_threads(typing, address, task_arguments, blocks):
 
     def emit(context, builder, signature, arguments):
         address, content, blocks = arguments
-        if not isinstance(content.type, ir.IntType):
-            content = builder.ptrtoint(content, INT64)
         table = cgutils.alloca_once(builder, ir.ArrayType(INT64, COLUMNS))
         table = builder.ptrtoint(table, INT64)
-        for column, value in enumerate((address, content, blocks, INT64(AT_ONCE))):
+        values = address, _as_integer(builder, content), blocks, INT64(AT_ONCE)
+        for column, value in enumerate(values):
             cell = builder.inttoptr(builder.add(table, INT64(8 * column)), POINTER)
             builder.store(value, cell)
         _call_run_job(builder, table, INT64(1))
@@ -421,12 +454,13 @@ class _ThreadPool:
         with self._starting:
             if not self.code:
                 options = compiler_options(count_references=False)
-                self.code = [
+                code = [
                     compile_callback(function, (types.int64,) * count, options)
                     for function, count in ((_run_job, 4), (_run_worker, 2), (_poll, 2))
                 ]
-                self.cells[RUN_JOB] = self.code[0].address
+                self.cells[RUN_JOB] = code[0].address
                 self.cells[FIRST_THREAD + LOCK] = _new_lock()
+                self.code = code
                 poll, count = self._c_function(2), 500
                 fastest = min(
                     timeit.repeat(lambda: poll(self.cells.ctypes.data, count), number=1, repeat=3)

@@ -218,9 +218,9 @@ def in_order(passes: Sequence[tuple[str, TermPasses]]) -> list[tuple[str, Pass]]
     """The passes of terms (name, passes) in the order in which they run, with their names. The
     order does not depend on numbers of blocks.
 
-    Of chains that run at the same time, the longest is the first, and the last term's of equal
-    ones: the grid of PME has the most passes, which wait for one another, and blocks of pairs fill
-    the time.
+    Chains that run at the same time are sorted by length, the longest first; of equal ones, the
+    last term's first. The grid of PME has the most passes, which wait for one another, and blocks
+    of pairs fill the time.
     """
     rows: list[tuple[str, Pass]] = []
     for job, field in enumerate(TermPasses._fields, 1):
@@ -230,13 +230,13 @@ def in_order(passes: Sequence[tuple[str, TermPasses]]) -> list[tuple[str, Pass]]
             has_blocks = any(one.blocks > 1 for _, chain in chains for one in chain)
             for k, (name, chain) in enumerate(chains):
                 rows += [(name, one.in_job(job, k) if has_blocks else one) for one in chain]
-        elif field == "loads":
-            for name, chain in chains:
-                rows += [
-                    (name, one.in_job(job, JOINED) if one.blocks > 1 else one) for one in chain
-                ]
         else:
-            rows += [(name, one) for name, chain in chains for one in chain]
+            joins = field == "loads"
+            rows += [
+                (name, one.in_job(job, JOINED) if joins and one.blocks > 1 else one)
+                for name, chain in chains
+                for one in chain
+            ]
     return rows
 
 

@@ -68,7 +68,7 @@ def _all_threads_again():
 
 
 @pytest.mark.parametrize("threads", [1, 2, MOST_THREADS])
-@pytest.mark.parametrize(("blocks", "work"), [(2, 0), (16, 10), (16, 10_000), (1000, 100)])
+@pytest.mark.parametrize(("blocks", "work"), [(0, 0), (2, 0), (16, 10), (16, 10_000), (1000, 100)])
 def test_every_block_is_done_once(threads, blocks, work):
     set_threads(min(threads, MOST_THREADS))
     seen = counted(blocks, work, 200)
@@ -180,6 +180,16 @@ def test_passes_follow_those_of_their_chain_and_all_of_earlier_jobs(threads, wor
         assert max(moments[12]) < min(moments[13])  # it has other blocks
 
 
+@pytest.mark.parametrize(
+    ("threads", "callers", "polls"), [("2", 1, 1000), ("7", 2, 2), ("24", 2, 20)]
+)
+def test_random_jobs_run_each_block_once_in_its_order(threads, callers, polls):
+    command = [sys.executable, "-m", "support.random_jobs", "2", str(callers), str(polls)]
+    environment = os.environ | {"NUMBA_NUM_THREADS": threads} | search_path(ROOT / "tests")
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 @task()
 def _meet(task_arguments, block):
     """Wait until the other of two passes has begun, and note whether it has."""
@@ -196,7 +206,7 @@ def _meet(task_arguments, block):
 @pytest.mark.skipif(MOST_THREADS == 1, reason="one core")
 @pytest.mark.parametrize(("chains", "expected"), [((0, 1), [1, 1]), ((0, 0), [0, 1])])
 def test_two_chains_run_at_the_same_time_and_one_in_its_order(chains, expected):
-    """Passes of two chains that wait for each other would else hang until the limit of this test."""
+    """Passes of two chains that wait for each other would otherwise hang until the test times out."""
     begun = np.zeros(4, np.int64)
     most = 10**12 if chains == (0, 1) else 1000
     passes = [
@@ -214,8 +224,10 @@ def test_no_block_is_called_after_a_pass_has_failed(threads):
     """Not even in the same job: they would read what it has left. The pool is then free."""
     set_threads(threads)
     for _ in range(20):
-        lines, status = entered([(9, 1, 1, 0, 0), (1, 40, 1, 0, 0), (2, 3, 0, 0, 0)])
-        assert (lines.tolist(), status) == ([[9, 0]], 9)
+        rows = [(9, 1, 1, 0, 0), (1, 40, 1, 0, 0), (3, 200, 1, 1, 100), (2, 3, 0, 0, 0)]
+        lines, status = entered(rows)
+        assert status == 9
+        assert {1, 2}.isdisjoint(lines[:, 0])
     assert (counted(16, 10, 10)[:, 0] == 10).all()
 
 

@@ -5,7 +5,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import compile_together, set_threads
+from rigidmd.compile import Pass, compile_together, set_threads
 from rigidmd.compile.kernels import CompileError
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme
@@ -190,22 +190,22 @@ class CpuEngine(CompiledEngine[Model, Advance]):
         extension, workspace = self._extension
         return extension.sums(workspace)
 
-    def measure(self, state: State) -> list[tuple[str, int, np.ndarray]]:
-        """Measure the rows of steps from now on, without those of its forces as a whole.
+    def measure(self, state: State) -> list[tuple[Pass, np.ndarray]]:
+        """Measure the rows of steps from now on, and the rows of the forces in place of those that
+        compute them.
 
         state : that `advance` has moved last
 
-        Returns the text of each row, its number of blocks, and the times of its blocks, see
-        `Program.measure`.
+        Returns the rows, and the times of their blocks, see `Program.measure`.
         """
         assert self._bound is not None
         steps = self._bound[1]
-        forces = [(f"{name}: {one.text}", one.blocks) for name, one in self.passes(state)]
-        moves = [(one.text, one.blocks) for one in steps.passes]
-        spent = self._dispatchers["steps"].program.measure()
-        rows = [(*text, of) for text, of in zip(forces, spent, strict=True)]
-        of_steps = zip(moves, steps.passes, steps.program.measure(), strict=True)
-        return rows + [(*text, of) for text, one, of in of_steps if not is_forces_row(one)]
+        forces = [one._replace(text=f"{name}: {one.text}") for name, one in self.passes(state)]
+        moves = zip(steps.passes, steps.program.measure(), strict=True)
+        return [
+            *zip(forces, self._dispatchers["steps"].program.measure(), strict=True),
+            *((one, spent) for one, spent in moves if not is_forces_row(one)),
+        ]
 
     def _prepare(self, state: State) -> tuple[NamedTuple, ...]:
         set_threads(usable_threads(self.threads))

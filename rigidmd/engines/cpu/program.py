@@ -2,7 +2,6 @@
 how many blocks, when."""
 
 import time
-from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -39,12 +38,13 @@ def program_of_forces(engine: CpuEngine, state: State) -> list[Row]:
     ]
 
 
-#: Steps before a measurement, steps that it has, and measurements for each number of threads.
-SETTLING, MEASURED, ROUNDS = 20, 30, 5
+#: Steps before the first measurement, before each, and of each: a multiple of the usual intervals
+#: of barostats. Measurements for each number of threads.
+BEGIN, SETTLING, MEASURED, ROUNDS = 20, 4, 100, 2
 
 
 class Profile(NamedTuple):
-    """Times of a step and its rows on numbers of threads, the first of which is 1; s."""
+    """Mean times of a step and its rows on numbers of threads, the first of which is 1; s."""
 
     threads: tuple[int, ...]
     steps: tuple[float, ...]
@@ -57,45 +57,43 @@ def profile_of(engine: CpuEngine, state: State, scheme: Scheme, dt: float) -> Pr
     """Measure the rows of steps from a state, which is copied, on one thread and on as many as the
     engine uses. dt in ps.
 
-    The time of a row of several blocks is the processor time of its blocks divided by the number of
-    threads, as such rows run at the same time; of one with a single block, the time that it takes.
-    Of the rounds for a number of threads, the one with the median time of a step counts. The engine
-    measures all later steps too. Raises SimulationError.
+    The time of a row in a job, or of several blocks, is the sum over its blocks divided by the
+    number of threads, since rows of a job run at the same time. The engine measures all later steps
+    too. Raises SimulationError.
     """
-    numbers = tuple(dict.fromkeys((1, usable_threads(engine.threads))))
+    asked = engine.threads
+    numbers = tuple(dict.fromkeys((1, usable_threads(asked))))
     state = engine.begin(state, scheme)
-    engine.advance(state, scheme, dt, SETTLING)
+    engine.advance(state, scheme, dt, BEGIN)
     rows = engine.measure(state)
-    rounds: dict[int, list[tuple[float, np.ndarray]]] = {count: [] for count in numbers}
-    for count in ROUNDS * numbers:
-        engine.threads = count
-        until = int(state.step[0]) + SETTLING
-        engine.advance(state, scheme, dt, until)
-        for _, _, spent in rows:
-            spent[:] = 0
-        began = time.perf_counter()
-        engine.advance(state, scheme, dt, until + MEASURED)
-        step = (time.perf_counter() - began) / MEASURED
-        busy = np.array([spent.sum() for _, _, spent in rows]) / (1e9 * MEASURED)
-        rounds[count].append((step, busy))
-    middle = [sorted(rounds[count], key=itemgetter(0))[ROUNDS // 2] for count in numbers]
-    (_, alone), (step, busy) = middle[0], middle[-1]
-    most = numbers[-1]
-    is_single = np.array([blocks == 1 for _, blocks, _ in rows])
+    steps = np.zeros(len(numbers))
+    sums = np.zeros((len(numbers), len(rows)))
+    try:
+        for k in ROUNDS * list(range(len(numbers))):
+            engine.threads = numbers[k]
+            until = int(state.step[0]) + SETTLING
+            engine.advance(state, scheme, dt, until)
+            before = np.array([spent.sum() for _, spent in rows])
+            began = time.perf_counter()
+            engine.advance(state, scheme, dt, until + MEASURED)
+            steps[k] += time.perf_counter() - began
+            sums[k] += 1e-9 * (np.array([spent.sum() for _, spent in rows]) - before)
+    finally:
+        engine.threads = asked
+    steps, sums = steps / (ROUNDS * MEASURED), sums / (ROUNDS * MEASURED)
+    is_single = np.array([one.blocks == 1 and one.job == ALONE for one, _ in rows])
+    times = np.where(is_single, sums, sums / np.array(numbers)[:, None])
     # a single block may call blocks of others on all threads, as when a list is built
-    work = np.where(is_single, np.maximum(busy, np.minimum(alone, most * busy)), busy)
-    times = [
-        np.where(is_single, of, of / count) for count, (_, of) in zip(numbers, middle, strict=True)
-    ]
-    steps = tuple(step for step, _ in middle)
+    most, alone = numbers[-1] * sums[-1], np.maximum(sums[0], sums[-1])
+    work = np.where(is_single, np.minimum(alone, most), sums[-1])
     lines = [
-        (text, tuple(float(of[k]) for of in times))
-        for k, (text, _, _) in enumerate(rows)
-        if alone[k] > 0
+        (one.text, tuple(of))
+        for (one, _), of in zip(rows, times.T.tolist(), strict=True)
+        if any(of)
     ]
-    rest = tuple(step - float(of.sum()) for step, of in zip(steps, times, strict=True))
-    idle = max(0.0, 1 - float(work.sum()) / (most * step))
-    return Profile(numbers, steps, [*lines, ("waiting, and all else", rest)], idle)
+    rest = tuple((steps - times.sum(axis=1)).tolist())
+    idle = max(0.0, 1 - float(work.sum()) / (numbers[-1] * float(steps[-1])))
+    return Profile(numbers, tuple(steps.tolist()), [*lines, ("waiting, and all else", rest)], idle)
 
 
 def describe_profile(profile: Profile) -> str:

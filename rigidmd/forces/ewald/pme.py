@@ -5,9 +5,9 @@ transforms.
     forces
 
 See the theory chapter `interactions`. The work is divided into blocks: planes, rows of Fourier
-components, and sites. Sites are sorted by plane, and each plane is written by one block. The number
-of blocks does not depend on the number of threads, so the result is the same bit for bit. This
-module needs rocket-fft. Only scenes with PME import it.
+components, and sites. Sites are sorted by planes and strips of planes, and each plane is written by
+one block. The number of blocks does not depend on the number of threads, so the result is the same
+bit for bit. This module needs rocket-fft. Only scenes with PME import it.
 """
 
 from fractions import Fraction
@@ -45,9 +45,9 @@ from rigidmd.forces.neighbors.sites import (
 from rigidmd.forces.neighbors.space import follow_cell
 from rigidmd.forces.terms import FORCES_ONLY, TALLIED, Evaluation, Setup, TermPasses
 
-STRIP = 4  # rows of a plane, whose sites are neighbours in the order
+STRIP = 4  # rows of a strip, whose sites are consecutive in the order
 PLANES = 16  # of a block, if there are more blocks than the minimum
-SERIAL_POINTS = 16**3  # up to this number of grid points there is one block, on the main thread
+SERIAL_POINTS = 16**3  # up to this number of grid points there is one block
 
 
 def weights(order: int) -> np.ndarray:
@@ -84,8 +84,7 @@ class PmeMesh(NamedTuple):
 
     points: np.ndarray  # (3,) number along a, b, c
     strides: np.ndarray  # (2,) of planes and rows in `flat`
-    # (4, blocks + 1) of planes, rows of Fourier components, sites, molecules
-    bounds: np.ndarray
+    bounds: np.ndarray  # (3, blocks + 1) of planes, rows of Fourier components and sites
     cell: np.ndarray  # (3, 3)
     reciprocal: np.ndarray  # (3, 3) rows 2 pi times the reciprocal edges, 1/Å
     force: np.ndarray  # (s, 3)
@@ -98,7 +97,7 @@ class PmeMesh(NamedTuple):
     order: np.ndarray  # (s,) int32 sites sorted by the strip of their corner
     first: np.ndarray  # (n_a + 1,) plane p has sites order[first[p]] ... order[first[p + 1] - 1]
     grid: np.ndarray  # (n_a, n_b + order - 1, n_c + width) charges, then potential
-    flat: np.ndarray  # (points,) the same memory
+    flat: np.ndarray  # the same memory, with one index
     spectrum: np.ndarray  # (n_a, n_b, n_c//2 + 1)
     influence: np.ndarray  # (n_a, n_b, n_c//2 + 1) potential over charge, by Fourier component
     alias: np.ndarray  # (3, 6, most points) errors.Aliases of the axes
@@ -137,13 +136,10 @@ class Pme(NamedTuple):
             table[d, :, : grid[d]] = aliases(grid[d], order)
         padded = np.zeros((grid[0], grid[1] + order - 1, grid[2] + width), kind)
         spectrum_shape = (grid[0], grid[1], grid[2] // 2 + 1)
-        molecules = len(self.sites.first) - 1
-        bounds = np.linspace(0, [*grid[:2], s, molecules], blocks + 1).astype(np.int64).T.copy()
-        bounds[2] = self.sites.first[bounds[3]]
         mesh = PmeMesh(
             points=np.array(grid, np.int64),
             strides=np.array([padded[0].size, padded[0, 0].size]),
-            bounds=bounds,
+            bounds=np.linspace(0, [grid[0], grid[1], s], blocks + 1).astype(np.int64).T.copy(),
             cell=np.zeros((3, 3)),
             reciprocal=np.zeros((3, 3)),
             force=np.zeros((s, 3)),
@@ -203,8 +199,8 @@ class PmeWorkspace(NamedTuple):
                     (sites, into.state, self.charge, mesh),
                     blocks,
                 ),
-                Pass("first site of each plane", _find_first_sites, (mesh, into.status)),
-                Pass("sort sites by plane", _sort_sites, (mesh,), blocks),
+                Pass("first site of each strip", _find_first_sites, (mesh, into.status)),
+                Pass("sort sites by strip", _sort_sites, (mesh,), blocks),
             ],
             forces=[
                 Pass("charges on the grid, transform of planes", _spread_charges, content, blocks),
@@ -277,34 +273,32 @@ def _set_influence(arguments, block):
 
 @task(count_references=False)
 def _find_cells(arguments, block):
-    """Grid cells of the sites of a block of molecules, and the number of sites in each plane."""
+    """Grid cells of the sites of a block, and their number in each strip."""
     sites, state, charge, mesh = load_arguments(arguments)
     mesh.not_finite[block] = False
     mesh.next_of_strip[block] = 0
     strips = mesh.next_of_strip[block]
     b, points = mesh.reciprocal, mesh.points
-    for m in range(mesh.bounds[3, block], mesh.bounds[3, block + 1]):
-        for n in range(sites.first[m], sites.first[m + 1]):
-            i = np.uint64(n)
-            r = locate_site(sites, state, m, n)
-            offset, cell = mesh.offset[i], mesh.corner[i]
-            for d in range(3):
-                turns = (r[0] * b[d, 0] + r[1] * b[d, 1] + r[2] * b[d, 2]) * (0.5 / pi)
-                x = (turns - np.floor(turns)) * points[d]
-                if not abs(x) < 1e9:
-                    mesh.not_finite[block] = True
-                    return
-                corner = np.int32(x)
-                offset[d] = x - corner - 0.5
-                cell[d] = corner if corner < points[d] else 0
-            offset[3] = charge[i]
-            strips[np.uint32(cell[0]), np.uint32(cell[1]) // np.uint32(STRIP)] += 1
+    for n in range(mesh.bounds[2, block], mesh.bounds[2, block + 1]):
+        i = np.uint64(n)
+        r = locate_site(sites, state, sites.molecule[i], n)
+        offset, cell = mesh.offset[i], mesh.corner[i]
+        for d in range(3):
+            turns = (r[0] * b[d, 0] + r[1] * b[d, 1] + r[2] * b[d, 2]) * (0.5 / pi)
+            x = (turns - np.floor(turns)) * points[d]
+            if not abs(x) < 1e9:
+                mesh.not_finite[block] = True
+                return
+            corner = np.int32(x)
+            offset[d] = x - corner - 0.5
+            cell[d] = corner if corner < points[d] else 0
+        offset[3] = charge[i]
+        strips[np.uint32(cell[0]), np.uint32(cell[1]) // np.uint32(STRIP)] += 1
 
 
 @task(count_references=False)
 def _find_first_sites(arguments, block):
-    """Where the sites of each plane and block start in the order by planes, if all are on the
-    grid."""
+    """Where the sites of each strip and block start in the order, if all are on the grid."""
     mesh, status = load_arguments(arguments)
     for b in range(len(mesh.not_finite)):
         if mesh.not_finite[b]:
@@ -323,7 +317,7 @@ def _find_first_sites(arguments, block):
 
 @task(count_references=False)
 def _sort_sites(arguments, block):
-    """Enter the sites of a block into the order by planes. The sort is stable."""
+    """Enter the sites of a block into the order by strips. The sort is stable."""
     (mesh,) = load_arguments(arguments)
     following = mesh.next_of_strip[block]
     for i in range(mesh.bounds[2, block], mesh.bounds[2, block + 1]):

@@ -165,6 +165,7 @@ def sort_into_clusters(clusters):
     s = len(clusters.slot)
     _, extent, (nx, ny, nz) = _bins(clusters)
     if not extent[0] >= 0:
+        clusters.slot[:] = 0  # no numbers of bins: `set_local` may follow before the next build
         return False
     order, bin_of, height = clusters.order, clusters.slot, clusters.moved
     start = np.zeros(nx * ny * nz + 1, np.int64)

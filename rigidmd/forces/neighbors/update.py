@@ -79,7 +79,7 @@ def list_passes(
 
 @task(count_references=False)
 def _move_list(arguments, block):
-    """Move the images of a list with the cell. A status code."""
+    """Move the images of a list with the cell, which has to be finite."""
     code, pairs, state, status = load_arguments(arguments)
     if not follow_cell(state.cell, pairs.cell):
         return

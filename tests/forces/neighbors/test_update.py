@@ -278,3 +278,16 @@ def test_a_list_with_almost_no_skin_is_built_at_every_step(precision):
         expected.force, abs=digits * np.abs(expected.force).max()
     )
     assert [own.pairs.counters[BUILDS] for own in engine.workspaces.values()] == [5, 5]
+
+
+@pytest.mark.parametrize("molecule", [0, 5, 299])
+def test_a_list_is_built_after_a_state_that_is_not_finite(molecule):
+    """The sort of its sites had left numbers of bins, also negative ones, as their slots."""
+    _, engine, state = built({"argon": 300}, 25.0, forces={"cutoff_A": 8.0})
+    force = engine.evaluate(state)[0].force
+    lost = state.copy()
+    lost.position[molecule] = np.nan
+    for _ in range(2):
+        with pytest.raises(NotFiniteError):
+            engine.evaluate(lost)
+        assert np.array_equal(engine.evaluate(state)[0].force, force)

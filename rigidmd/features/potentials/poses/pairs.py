@@ -94,7 +94,7 @@ class BodyPairsWorkspace(NamedTuple):
         tallied = (term, near.pairs, sums, sums.tallies)
         with_energies = "forces and energies of pairs of bodies"
         return of_list._replace(
-            positions=[poses, *of_list.positions],
+            positions=[*of_list.positions, poses],
             forces=[
                 Pass("forces of pairs of bodies", _add_pairs, plain, BLOCKS, FORCES_ONLY),
                 Pass(with_energies, _add_pairs, tallied, BLOCKS, TALLIED),
