@@ -167,6 +167,13 @@ def translational_energy(model, state):
 
 
 @kernel
+def kinetic_energy(model, state):
+    """Translational and rotational kinetic energy of all molecules (u Å²/ps²)."""
+    moving, turning = _energies(model, state, 0, len(state.velocity))
+    return moving + turning
+
+
+@kernel
 def _energies(model, state, first, end):
     velocity, momentum = state.velocity, state.angular_momentum_body
     return kinetic_energies(
