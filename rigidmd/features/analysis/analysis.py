@@ -73,11 +73,9 @@ def _check_results(results: object, name: str) -> None:
             f"{of} takes the results of a run, not its path:"
             f" {of}(rigidmd.read_run({str(results)!r}))"
         )
-    of_sweep = (
-        "; of a sweep give a list of rigidmd.read_run(path) for the paths in table.runs.values()"
-    )
     raise TypeError(
-        f"{of} takes the results of a run, or a list of them, not {results!r:.80}{of_sweep}"
+        f"{of} takes the results of a run, or a list of them, not {results!r:.80}; of a sweep give"
+        " a list of rigidmd.read_run(path) for the paths in table.runs.values()"
     )
 
 

@@ -99,8 +99,7 @@ class BodyAnimation(Animation):
             self.unit = 1.05 * extent + mesh.reach * enlarged
             self.position = path = (position - middle) / self.unit
             if turns and enlarged > 1:
-                times = f"{enlarged:.3g} times larger than to scale"
-                self.notes.append(f"The body is drawn {times}.")
+                self.notes.append(f"The body is drawn {enlarged:.3g} times larger than to scale.")
         else:
             self.unit = 1.08 * radius
             self.position = path = np.zeros_like(position)

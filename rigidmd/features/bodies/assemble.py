@@ -192,13 +192,10 @@ def _body_errors(
     if scene.output.drawn_as == "top" and rotates:
         at_centre, _ = principal(inertia_at_centre(scene))
         if axis_of_symmetry(at_centre) is None:
-            these = (
-                f"these are {', '.join(f'{x:.4g}' for x in at_centre)} kg m². Name 'cuboid',"
-                " 'ellipsoid' or a solid"
-            )
             yield (
-                "output.drawn_as: a top has two equal moments of inertia about its centre of mass,"
-                f" and {these}"
+                "output.drawn_as: a top has two equal moments of inertia about its centre of"
+                f" mass, and these are {', '.join(f'{x:.4g}' for x in at_centre)} kg m². Name"
+                " 'cuboid', 'ellipsoid' or a solid"
             )
     if scene.body.pinned:
         if scene.changing_inertia is not None and centre.any():
@@ -250,11 +247,10 @@ def _keys_of_principal_axes(scene: BodyScene) -> Iterator[str]:
             if not isinstance(value, tuple) or key == "centre_of_buoyancy_m":
                 continue
             if len(set(value)) > 1 or (key == "dry_N_m" and any(value)):
-                why = (
-                    "which are not principal axes of its inertia: give the body in its principal"
-                    " axes"
+                yield (
+                    f"{name}.{key} is given along the body's axes, which are not principal axes of"
+                    " its inertia: give the body in its principal axes"
                 )
-                yield f"{name}.{key} is given along the body's axes, {why}"
 
 
 def _torque_errors(scene: BodyScene, axes: np.ndarray, moments: np.ndarray) -> Iterator[str]:

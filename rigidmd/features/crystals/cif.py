@@ -524,12 +524,10 @@ def _contents(
     notes = []
     if order > 1:
         composition = " ".join(f"{kind}{n}" for kind, n in sorted(count.items()))
-        origin = (
-            f"{len(kinds)} atom{'s' * (len(kinds) > 1)} in the file,"
-            f" {contents.special_count} on special positions"
-        )
         notes.append(
-            f"its cell of {volume:.5g} Å³ holds {composition}, {density:.4g} g/cm³, from {origin}"
+            f"its cell of {volume:.5g} Å³ holds {composition}, {density:.4g} g/cm³, from"
+            f" {len(kinds)} atom{'s' * (len(kinds) > 1)} in the file, {contents.special_count} on"
+            " special positions"
         )
     if contents.copy_count:
         notes.append(

@@ -87,11 +87,10 @@ class CustomForce(AddedForce):
 
     def _errors(self):
         if sum(source is not None for source in (self.module, self.energy, self.table)) != 1:
-            kinds = (
-                "a module, a Python file with the force, an energy, a formula of r, or a table, a"
-                " file of energies"
+            yield (
+                "give a module, a Python file with the force, an energy, a formula of r, or a"
+                " table, a file of energies"
             )
-            yield f"give {kinds}"
         if self.module is not None:
             of_energy = ("sites", "pairs", "mixing", "truncation", "cutoff_A", "switch_start_A")
             idle = [key for key in of_energy if getattr(self, key) not in (None, (), {})]

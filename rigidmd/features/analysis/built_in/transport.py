@@ -246,10 +246,9 @@ def viscosity(runs: Runs) -> AnalysisResult:
     interval = _interval_of(runs)
     length = interval * sum(map(len, stresses))
     if length < LEAST_TENSOR:
-        have = f"{length - interval * len(stresses):.3g} ps"
         raise OutputError(
             f"a viscosity needs at least {LEAST_TENSOR:g} ps of the pressure tensor; there are"
-            f" {have}"
+            f" {length - interval * len(stresses):.3g} ps"
         )
     factor = runs.volume / runs.thermal_energy / MPA_S
     start = np.mean([correlation(stress, 2) for stress in stresses], axis=0)

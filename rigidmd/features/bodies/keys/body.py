@@ -162,11 +162,10 @@ class SolidPart(Solid):
         if self.axis is not None and self.euler_angles_deg is not None:
             errors.append("give axis or euler_angles_deg, not both")
         elif self.axis is not None and self.shape in WITHOUT_AXIS:
-            rotation = (
-                f"{'an' if self.shape == 'ellipsoid' else 'a'} {self.shape} may be rotated about"
-                " its axis"
+            errors.append(
+                f"axis is not enough, as {'an' if self.shape == 'ellipsoid' else 'a'} {self.shape}"
+                " may be rotated about its axis: give euler_angles_deg"
             )
-            errors.append(f"axis is not enough, as {rotation}: give euler_angles_deg")
         elif self.axis is not None and not any(self.axis):
             errors.append("axis is zero, which is not a direction")
         return errors
@@ -331,22 +330,20 @@ class BodyStart(Section):
                     what = "a reflection"
                 else:
                     what = f"|Q^T Q - 1| is {error:.2g}"
-                limit = (
-                    f"must be below {LARGEST_ORTHOGONALITY_ERROR:g}. project = true uses the"
-                    " nearest rotation"
+                yield (
+                    f"the matrix is not a rotation: {what}, must be below"
+                    f" {LARGEST_ORTHOGONALITY_ERROR:g}. project = true uses the nearest rotation"
                 )
-                yield f"the matrix is not a rotation: {what}, {limit}"
         if self.quaternion_wxyz is not None and not any(self.quaternion_wxyz):
             yield "quaternion_wxyz is zero, which is not a rotation"
         if self.euler_rates_rad_s is not None:
             if self.euler_angles_deg is None:
                 yield "euler_rates_rad_s needs euler_angles_deg"
             elif self.euler_angles_deg[1] % 180 == 0:
-                why = (
-                    "phi' and psi' rotate about the same axis there. Give"
-                    " angular_velocity_body_rad_s"
+                yield (
+                    f"euler_rates_rad_s with theta = {self.euler_angles_deg[1]:g}: phi' and psi'"
+                    " rotate about the same axis there. Give angular_velocity_body_rad_s"
                 )
-                yield f"euler_rates_rad_s with theta = {self.euler_angles_deg[1]:g}: {why}"
 
     @property
     def attitude(self) -> np.ndarray:

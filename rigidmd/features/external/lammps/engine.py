@@ -88,11 +88,10 @@ class LammpsEngine(ExternalEngine):
         )
         if rank_count != ranks:
             self.close()
-            problem = (
+            raise EngineError(
                 f"LAMMPS has {rank_count:.0f} ranks instead of {ranks}: the launcher belongs to"
-                " another MPI"
+                " another MPI. Put the mpirun of LAMMPS on the PATH, or use 1 rank"
             )
-            raise EngineError(f"{problem}. Put the mpirun of LAMMPS on the PATH, or use 1 rank")
         self.version = f"LAMMPS {date:.0f}"
 
     def _run(self, state: State, steps: int, dt: float) -> None:

@@ -159,11 +159,10 @@ def with_user_code(system: System, *, is_start: bool = True) -> System:
         except (SceneError, UserForceError, ValueError) as error:
             errors += [f"{name}: {message}" for message in getattr(error, "errors", [error])]
     if not (thermostat is None or is_thermostat(thermostat)):
-        need = (
-            "a NamedTuple of a class with rigidmd.compiled_thermostat nor has a method"
-            " for_stage(system, k)"
+        errors.append(
+            f"thermostat: {thermostat!r:.60} is neither a NamedTuple of a class with"
+            " rigidmd.compiled_thermostat nor has a method for_stage(system, k)"
         )
-        errors.append(f"thermostat: {thermostat!r:.60} is neither {need}")
     if errors:
         raise SceneError(scene.source, errors)
     for name, term in bound.items():
@@ -227,13 +226,10 @@ def _bind_term(force: object, system: System) -> BoundTerm:
     if isinstance(made, PairForces):  # with a potential that is not a `PairPotential`
         check_cutoff(made.potential.cutoff, system)  # type: ignore[attr-defined]  # every pair potential has a cutoff
     elif type(made) not in FORCES:
-        compiled = (
-            "a NamedTuple of a class with rigidmd.compiled_force, or an object whose term(system)"
-            " makes one"
-        )
         raise ValueError(
-            f"{made!r:.80} is not a force: give a rigidmd.Force, a rigidmd.pair_potential,"
-            f" {compiled}"
+            f"{made!r:.80} is not a force: give a rigidmd.Force, a rigidmd.pair_potential, a"
+            " NamedTuple of a class with rigidmd.compiled_force, or an object whose term(system)"
+            " makes one"
         )
     term = cast(NamedTuple, made)
     if isinstance(force, AddedForce):

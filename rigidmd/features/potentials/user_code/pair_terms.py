@@ -432,12 +432,9 @@ class SiteTypes:
             elif rule == "harmonic" and a + b != 0:
                 mixed[name] = 2 * a * b / (a + b)
             else:
-                what = (
-                    f"{name} of {self.example(i)} and {self.example(j)}, {a:g} and {b:g}, have no"
-                    f" {rule} mean"
-                )
                 faults.append(
-                    f"{what}: give {name} of that pair in pairs, or another rule in mixing"
+                    f"{name} of {self.example(i)} and {self.example(j)}, {a:g} and {b:g}, have no"
+                    f" {rule} mean: give {name} of that pair in pairs, or another rule in mixing"
                 )
                 return None
         return mixed

@@ -46,12 +46,9 @@ def read_columns(path: Path) -> Columns:
     if lines and not _is_number(lines[0][1][0]):
         (number, names), lines = lines[0], lines[1:]
         if not {*COLUMNS[:2]} <= {*names} <= {*COLUMNS} or len({*names}) < len(names):
-            known = (
-                "r_A (Å), energy_kJ_mol (kJ/mol) and, if you like, force_kJ_mol_A (-dE/dr,"
-                " kJ/mol/Å)"
-            )
             raise PairPotentialError(
-                f"{path}: line {number}: the columns are {', '.join(names)}. They must be {known}"
+                f"{path}: line {number}: the columns are {', '.join(names)}. They must be r_A (Å),"
+                " energy_kJ_mol (kJ/mol) and, if you like, force_kJ_mol_A (-dE/dr, kJ/mol/Å)"
             )
     for number, words in lines:
         values = [float(word) if _is_number(word) else inf for word in words]

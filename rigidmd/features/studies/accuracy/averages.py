@@ -134,10 +134,9 @@ def _with_thermostat(scene: MolecularScene) -> Stage:
     """The last stage. Raises SceneError unless it has a thermostat at one temperature."""
     stage = scene.stages[-1]
     if not stage.has_thermostat:
-        advice = "give it ensemble = 'nvt' or 'npt'"
         error = (
             f"{option('averages')} samples the last stage, and {stage.ensemble} has no thermostat:"
-            f" {advice}"
+            " give it ensemble = 'nvt' or 'npt'"
         )
         raise SceneError(scene.source, [error])
     if len(set(stage.temperatures)) > 1 or (

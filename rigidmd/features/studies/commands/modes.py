@@ -150,10 +150,9 @@ def _describe(modes: "NormalModes") -> Iterator[str]:
         )
     if not modes.cells:  # of the whole crystal other modes may be faster
         _, kind, *_, part, _, where = table.values(last)
-        mode = f"mode {total}: {kind} of {part:.3g} molecules, largest in {where}"
         yield (
-            f"  longest stable step of velocity Verlet {modes.longest_step_fs:.3g} fs, set by"
-            f" {mode}"
+            f"  longest stable step of velocity Verlet {modes.longest_step_fs:.3g} fs, set by mode"
+            f" {total}: {kind} of {part:.3g} molecules, largest in {where}"
         )
     zero = [k for k in table.rows if modes.rate[k] == 0]
     if zero:

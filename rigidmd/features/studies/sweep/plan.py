@@ -124,8 +124,7 @@ def _parse_range(piece: str, text: str) -> range | None:
     if ends is None:
         return None
     if any(parse_whole_number(end.removeprefix("-")) is None for end in ends.groups()):
-        problem = "is not a range of whole numbers. List the values: 0.1,0.2"
-        raise _error(text, f": {piece} {problem}")
+        raise _error(text, f": {piece} is not a range of whole numbers. List the values: 0.1,0.2")
     first, last = map(int, ends.groups())
     if last < first:
         raise _error(text, f": the range {piece} is empty. Begin with the smaller number")
