@@ -5,6 +5,7 @@ the computation. Equal nodes are one, and parts that are constant are computed h
 """
 
 import math
+import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
@@ -35,7 +36,7 @@ class Graph:
         numbers = [part.number for part in parts if part.number is not None]
         if len(numbers) == len(parts):
             return self.constant(computed(kind, numbers))
-        short = _SIMPLER[kind](self, *parts) if kind in _SIMPLER else None
+        short = _SIMPLER[kind](*parts) if kind in _SIMPLER else None
         return self._node(kind, parts) if short is None else short
 
     def power(self, base: "Traced", exponent: "Traced") -> "Traced":
@@ -77,6 +78,11 @@ def _operators(kind: str) -> tuple[Callable, Callable]:
     return first, second
 
 
+def _function(kind: str) -> "Callable[[Traced], Traced]":
+    """The method of a function of one number."""
+    return lambda node: node.graph.node(kind, node)
+
+
 class Traced:
     """A node: a number, or a condition, of a traced function."""
 
@@ -103,14 +109,10 @@ class Traced:
     __mul__, __rmul__ = _operators("multiply")
     __truediv__, __rtruediv__ = _operators("divide")
 
-    def __neg__(self):
-        return self.graph.node("negative", self)
+    __neg__, __abs__ = _function("negative"), _function("fabs")
 
     def __pos__(self):
         return self
-
-    def __abs__(self):
-        return self.absolute()
 
     def __pow__(self, exponent: "Number | np.ndarray"):
         if isinstance(exponent, np.ndarray):
@@ -137,32 +139,9 @@ class Traced:
 
     # functions of NumPy, which it finds by these names for arrays of objects
 
-    def sqrt(self):
-        return self.graph.node("sqrt", self)
-
-    def exp(self):
-        return self.graph.node("exp", self)
-
-    def log(self):
-        return self.graph.node("log", self)
-
-    def sin(self):
-        return self.graph.node("sin", self)
-
-    def cos(self):
-        return self.graph.node("cos", self)
-
-    def tanh(self):
-        return self.graph.node("tanh", self)
-
-    def arccos(self):
-        return self.graph.node("acos", self)
-
-    def erfc(self):
-        return self.graph.node("erfc", self)
-
-    def absolute(self):
-        return self.graph.node("fabs", self)
+    sqrt, exp, log = _function("sqrt"), _function("exp"), _function("log")
+    sin, cos, tanh = _function("sin"), _function("cos"), _function("tanh")
+    arccos, erfc, absolute = _function("acos"), _function("erfc"), _function("fabs")
 
     def square(self):
         return self * self
@@ -175,8 +154,7 @@ class Traced:
             return NotImplemented
         numbers = [value for value in inputs if not isinstance(value, np.ndarray)]
         if len(numbers) < len(inputs):
-            arrays = [_as_objects(value) for value in inputs]
-            return _each(lambda *values: ufunc(*values), *arrays)
+            return _each(ufunc, *(np.array(value, object) for value in inputs))
         name = ufunc.__name__
         if name in _OPERATORS:
             return _OPERATORS[name](*map(self._other, numbers))
@@ -204,14 +182,6 @@ class Traced:
 
 #: A number that is recorded, or a constant.
 Number = Traced | float
-
-
-def _as_objects(value: Number | np.ndarray) -> np.ndarray:
-    array = np.empty((), object)
-    if isinstance(value, np.ndarray):
-        return value.astype(object)
-    array[()] = value
-    return array
 
 
 def _each(function: Callable, *arrays: np.ndarray) -> np.ndarray:
@@ -246,27 +216,24 @@ FUNCTIONS = (
     "maximum",
     "where",
 )
-_OPERATORS: dict[str, Callable] = {
-    "add": lambda x, y: x + y,
-    "subtract": lambda x, y: x - y,
-    "multiply": lambda x, y: x * y,
-    "divide": lambda x, y: x / y,
-    "power": lambda x, y: x**y,
-    "float_power": lambda x, y: x**y,
-    "less": lambda x, y: x < y,
-    "less_equal": lambda x, y: x < y,
-    "greater": lambda x, y: x > y,
-    "greater_equal": lambda x, y: x > y,
+#: Names of nodes and of functions of NumPy with two numbers.
+_BINARY: dict[str, Callable] = {
+    "add": operator.add,
+    "subtract": operator.sub,
+    "multiply": operator.mul,
+    "divide": operator.truediv,
+    "power": operator.pow,
+    "less": operator.lt,
+}
+_OPERATORS = _BINARY | {
+    "float_power": operator.pow,
+    "less_equal": operator.lt,
+    "greater": operator.gt,
+    "greater_equal": operator.gt,
 }
 #: Kind of a node -> its value.
-_VALUES: dict[str, Callable] = {
-    "add": lambda x, y: x + y,
-    "subtract": lambda x, y: x - y,
-    "multiply": lambda x, y: x * y,
-    "divide": lambda x, y: x / y,
-    "negative": lambda x: -x,
-    "power": lambda x, y: x**y,
-    "less": lambda x, y: float(x < y),
+_VALUES = _BINARY | {
+    "negative": operator.neg,
     "where": lambda condition, x, y: x if condition else y,
 }
 
@@ -281,7 +248,7 @@ def computed(kind: str, numbers: Sequence[float]) -> float:
     return float(value)
 
 
-def _simpler_sum(graph: Graph, x: Traced, y: Traced) -> Traced | None:
+def _simpler_sum(x: Traced, y: Traced) -> Traced | None:
     if x.number == 0:
         return y
     if y.number == 0:
@@ -289,17 +256,17 @@ def _simpler_sum(graph: Graph, x: Traced, y: Traced) -> Traced | None:
     return x - y.parts[0] if y.kind == "negative" else None
 
 
-def _simpler_difference(graph: Graph, x: Traced, y: Traced) -> Traced | None:
+def _simpler_difference(x: Traced, y: Traced) -> Traced | None:
     if y.number == 0:
         return x
     if x.number == 0:
         return -y
     if x is y:
-        return graph.constant(0.0)
+        return x.graph.constant(0.0)
     return x + y.parts[0] if y.kind == "negative" else None
 
 
-def _simpler_product(graph: Graph, x: Traced, y: Traced) -> Traced | None:
+def _simpler_product(x: Traced, y: Traced) -> Traced | None:
     for one, other in ((x, y), (y, x)):
         if one.number == 0:
             return one
@@ -312,7 +279,7 @@ def _simpler_product(graph: Graph, x: Traced, y: Traced) -> Traced | None:
     return None
 
 
-def _simpler_quotient(graph: Graph, x: Traced, y: Traced) -> Traced | None:
+def _simpler_quotient(x: Traced, y: Traced) -> Traced | None:
     if x.number == 0 or y.number == 1:
         return x
     if y.number is not None:
@@ -325,5 +292,5 @@ _SIMPLER: dict[str, Callable] = {
     "subtract": _simpler_difference,
     "multiply": _simpler_product,
     "divide": _simpler_quotient,
-    "negative": lambda graph, x: x.parts[0] if x.kind == "negative" else None,
+    "negative": lambda x: x.parts[0] if x.kind == "negative" else None,
 }
