@@ -259,10 +259,7 @@ def _torque_errors(scene: BodyScene, axes: np.ndarray, moments: np.ndarray) -> I
         if not moments.any() and (entry.torque_N_m is not None or entry.at_m is not None):
             yield f"applied.{k}: a point has no inertia, and a torque cannot rotate it"
         elif (moments == 0).any() and (entry.axes == "body" or entry.at_m is not None):
-            torques = (
-                np.atleast_2d(entry.torque_N_m if entry.torque_N_m is not None else np.zeros(3))
-                @ axes
-            )
+            torques = np.atleast_2d(entry.torque_N_m or np.zeros(3)) @ axes
             arm = axes.T @ np.array(entry.at_m or (0.0, 0.0, 0.0))
             if torques[:, moments == 0].any() or arm[moments > 0].any():
                 yield f"applied.{k}: nothing resists a torque about the axis of a linear body"
@@ -305,8 +302,8 @@ def _integrator_errors(scene: BodyScene, *, immersed: bool, has_functions: bool)
         "wheels": scene.wheels,
         "changing_inertia": scene.changing_inertia,
         "added mass": immersed,
+        "a frame that changes its axis": axis_changes,
     }
-    why["a frame that changes its axis"] = axis_changes
     split = [name for name, other in SCHEMES.items() if not other.exact_rotor]
     return [
         f"run: the free motion of a body with {what} has no exact flow: {run.integrator} would be"

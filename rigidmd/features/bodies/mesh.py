@@ -92,9 +92,7 @@ def mesh_of(system: BodySystem) -> Mesh:
 
 
 def _solid_mesh(solid: Solid, position: np.ndarray) -> Mesh:
-    size = np.zeros(3)
-    for name, axes in SOLIDS[solid.shape].dimensions.items():
-        size[axes] = solid.dimensions[name]
+    size = SOLIDS[solid.shape].scale(solid.dimensions)
     unit = UNITS.get(solid.shape, BALL)
     about = f"{'an' if solid.shape[0] in 'aeiou' else 'a'} {solid.shape}"
     return unit._replace(
@@ -221,7 +219,7 @@ def _revolve(rings: list[tuple[float, float]], *, closed: bool = False) -> Mesh:
     """A solid of revolution about axis 3 from circles (radius, z), from below. A quarter of its
     side is painted. A `closed` one is a ring, without discs at its ends."""
     n = CIRCLE_CORNERS
-    corner = np.arange(CIRCLE_CORNERS)
+    corner = np.arange(n)
     angle = 2 * np.pi * corner / n
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     vertices = np.concatenate([np.column_stack([r * circle, np.full(n, z)]) for r, z in rings])

@@ -92,8 +92,7 @@ def _of_heavy_body(
     force times point of action, principal axes, N m"""
     axis = moment / np.linalg.norm(moment)
     size = float(np.linalg.norm(moment))
-    path = _path_of_axis(motion, system.axes @ axis)
-    polar, azimuth = _angles(path, -down)
+    polar, azimuth = _angles(motion["Q"] @ (system.axes @ axis), -down)
     rates = {}
     along = axis**2 @ system.inertia
     across = float(np.delete(system.inertia, np.abs(axis).argmax())[0])
@@ -139,7 +138,7 @@ def _of_free_body(system: BodySystem, motion: Motion) -> dict[str, Rate]:
         return {}
     if system.kind == "symmetric":
         k = int(np.abs(inertia - np.median(inertia)).argmax())
-        polar, azimuth = _angles(_path_of_axis(motion, system.axes[:, k]), momentum / size)
+        polar, azimuth = _angles(motion["Q"] @ system.axes[:, k], momentum / size)
         omega = _vectors(motion, "omega_body") @ system.axes[:, k]
         rates = {"spin_rad_s": Rate(float(omega.mean()), None)}
         if SMALL_ANGLE < polar[0] < np.pi - SMALL_ANGLE:
@@ -169,11 +168,6 @@ def _vectors(motion: Motion, family: str) -> np.ndarray:
     return np.stack(
         [motion[f"{family}_{k}"] for k in ("xyz" if family.endswith("lab") else "123")], axis=-1
     )
-
-
-def _path_of_axis(motion: Motion, axis_body: np.ndarray) -> np.ndarray:
-    """Directions (t, 3) of a body axis in the lab."""
-    return motion["Q"] @ axis_body
 
 
 def _angles(path: np.ndarray, pole: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:

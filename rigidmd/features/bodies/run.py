@@ -269,10 +269,8 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
     def prepare(self) -> None:
         system = self.system
         run = self.scene.run
-        compiled = self.system.engine()
-        compiled.advance(
-            compiled.begin(system.state, system.method), system.method, run.timestep_s, 0
-        )
+        compiled, method = system.engine(), system.method
+        compiled.advance(compiled.begin(system.state, method), method, run.timestep_s, 0)
         if run.has_scheme and (names := system.velocity_dependent_functions()):
             self.simulation._note(
                 f"{' and '.join(names)}: depends on velocities, so that {run.integrator} is of"
@@ -341,7 +339,7 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
 
     def default_observers(self) -> list[Observer]:
         output = self.scene.output
-        interval = not_none(self.scene.output.interval_s)
+        interval = not_none(output.interval_s)
         self._sampler, self._watch = Sampler(interval), BodyWatch(self.simulation)
         files: list[Observer] = []
         if output.trajectory:
@@ -349,15 +347,12 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
             files = [Frames(interval, not_none(output.topology), output.trajectory, velocities)]
         if self.simulation.folder is not None:
             files = [SceneFile(), *files, MotionFiles(self._sampler, npz=output.npz)]
-            files += self._figures() if output.figures else []
+            if output.figures:  # which others need not import
+                from rigidmd.features.bodies.figures import FIGURES
+                from rigidmd.features.view.figures.run import Figures
+
+                files.append(Figures(FIGURES, ("png", "svg")))
         return [*files, self._sampler, self._watch]
-
-    @staticmethod
-    def _figures() -> list[Observer]:
-        from rigidmd.features.bodies.figures import FIGURES  # for runs with figures only
-        from rigidmd.features.view.figures.run import Figures
-
-        return [Figures(FIGURES, ("png", "svg"))]
 
     def samples(self) -> Motion:
         return motion(self.system, self._sampler.states)

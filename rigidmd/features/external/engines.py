@@ -17,7 +17,7 @@ from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.programs import Program
 from rigidmd.core.state import NOW, State
 from rigidmd.engines.observables import kinetic_energies, observe
-from rigidmd.engines.protocol import Engine, keep_time
+from rigidmd.engines.protocol import Engine, NotFiniteError, Tally, keep_time
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 from rigidmd.features.external.force_field import (
@@ -182,6 +182,19 @@ class ExternalEngine(Engine, ABC):
     @abstractmethod
     def _receive(self, state: State) -> None:
         """Write the program's state, and its heat, into `state`."""
+
+
+def tallies_of(energies: Mapping[str, float], virial: np.ndarray) -> dict[str, Tally]:
+    """Energies of terms, the first with the whole virial."""
+    return {
+        name: Tally(float(energy), np.zeros((3, 3)) if k else virial)
+        for k, (name, energy) in enumerate(energies.items())
+    }
+
+
+def not_finite(state: State) -> NotFiniteError:
+    """The error of a program that moves a state to positions that are not finite."""
+    return NotFiniteError(state._replace(position=np.full_like(state.position, np.nan)))
 
 
 def same_state(one: State | None, other: State) -> bool:

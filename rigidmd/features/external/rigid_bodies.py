@@ -189,13 +189,8 @@ class MassPoints(NamedTuple):
         for i in range(len(self.mass)):
             for j in range(i):
                 d = float(np.linalg.norm(self.position_body[i] - self.position_body[j]))
-                distances.append(
-                    (
-                        j,
-                        i,
-                        next((other for *_, other in distances if abs(d - other) <= SAME * d), d),
-                    )
-                )
+                same = (other for *_, other in distances if abs(d - other) <= SAME * d)
+                distances.append((j, i, next(same, d)))
         return distances
 
 

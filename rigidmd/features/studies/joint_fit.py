@@ -176,8 +176,7 @@ def fit_jointly(runs: Mapping[float, Sequence[RunResults]]) -> JointLimits:
             _Step([points[name][k] for name in used], correlation, _next_terms(points, together, k))
             for k in range(len(points[BALANCE]))
         ]
-        fits = _fit_with_slopes(steps)
-        for name, fit in zip(together, fits, strict=True):
+        for name, fit in zip(together, _fit_with_slopes(steps), strict=True):
             joint.setdefault(name, (points[name], fit))
     plain = names[names.index(BALANCE) + 1 :]
     return JointLimits(joint, {name: (points[name], extrapolate(points[name])) for name in plain})

@@ -87,7 +87,7 @@ class Coordinates:
         self.system = system
         self.enthalpy, self.state = Enthalpy(system, Stage(ensemble="minimise"), state), state
         model = system.model
-        species = system.model.species
+        species = model.species
         rotations = (
             np.sqrt(model.inverse_inertia[species[: len(state.rotation)]]) * self.enthalpy.arm
         )
@@ -234,13 +234,9 @@ class NormalModes:
         str
             "zero", "translation" or "libration"
         """
-        return (
-            "zero"
-            if self.rate[k] == 0
-            else "translation"
-            if self.translation[k] >= 0.5
-            else "libration"
-        )
+        if self.rate[k] == 0:
+            return "zero"
+        return "translation" if self.translation[k] >= 0.5 else "libration"
 
     def is_vibration(self, number: int) -> bool:
         """Whether a mode was computed and has a frequency.
@@ -555,8 +551,8 @@ def write_animation(folder: Path, modes: NormalModes, number: int) -> None:
 
     c = modes.coordinates
     system = modes.system
-    scene = modes.system.scene
-    output = modes.system.scene.output
+    scene = system.scene
+    output = scene.output
     if not modes.is_vibration(number):
         raise SceneError(
             scene.source,
@@ -574,12 +570,8 @@ def write_animation(folder: Path, modes: NormalModes, number: int) -> None:
     for step in range(PERIODS * FRAMES + 1):
         state = c.at(np.cos(2 * pi * step / FRAMES) * q)
         time = period * step / FRAMES
-        state.velocity[:], state.angular_momentum_body[:], state.time[NOW], state.step[NOW] = (
-            0,
-            0,
-            time,
-            step,
-        )
+        state.velocity[:] = state.angular_momentum_body[:] = 0
+        state.time[NOW], state.step[NOW] = time, step
         frames.write(state, time, step)
         log.write(observe(system, c.enthalpy.engine, state, len(scene.stages) - 1).sample)
     frames.close()

@@ -85,6 +85,13 @@ def interval_and_lags(runs: Runs, what: str) -> tuple[float, int]:
     return runs.interval, lags
 
 
+def _displacement(runs: Runs, kind: Kind, lags: int) -> tuple[np.ndarray, np.ndarray]:
+    """`squared_displacement` of a species, with its error."""
+    return with_group_error(
+        runs, kind, lambda part, group: squared_displacement(part.paths[:, group.index], lags)
+    )
+
+
 @built_in(
     "mean squared displacement of the centres of mass", position=50, needs=(trajectory, motion)
 )
@@ -97,10 +104,7 @@ def msd(runs: Runs) -> AnalysisResult:
     time = ("Time (ps)", interval * np.arange(lags))
     curve = Curve("msd", time, "MSD (Å²)", {}, log=(True, True), power=1.0)
     for kind in runs.moving:
-        displacement_and_error = with_group_error(
-            runs, kind, lambda part, group: squared_displacement(part.paths[:, group.index], lags)
-        )
-        curve.add(f"MSD {kind.name} (A^2)", *displacement_and_error)
+        curve.add(f"MSD {kind.name} (A^2)", *_displacement(runs, kind, lags))
     return AnalysisResult("msd", "mean squared displacement", curves=[curve])
 
 
@@ -186,10 +190,9 @@ def diffusion(
         except OutputError as error:
             eta = eta._replace(note=str(error))
     for kind in runs.moving:
-        displacement_and_error = with_group_error(
-            runs, kind, lambda part, group: squared_displacement(part.paths[:, group.index], lags)
+        so_far = (
+            values[1:] / (6 * NM2_PER_S * later) for values in _displacement(runs, kind, lags)
         )
-        so_far = (values[1:] / (6 * NM2_PER_S * later) for values in displacement_and_error)
         curve.add(f"MSD/6t {kind.name} (1e-9 m^2/s)", *so_far)
         name = f"D of {kind.name}"
         (D, bend), (error, doubt) = np.array(with_group_error(runs, kind, slopes)).tolist()

@@ -22,11 +22,16 @@ from rigidmd.core.signals import SEPARATE_GROUP, kill_group
 from rigidmd.core.state import HEAT, NOW, ORIGIN, Load, State
 from rigidmd.dynamics.model import Model
 from rigidmd.engines.observables import kinetic_energies
-from rigidmd.engines.protocol import NotFiniteError, Tally
+from rigidmd.engines.protocol import Tally
 from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SimulationError, StructureError
 from rigidmd.features.crystals.lammps import dump_box
-from rigidmd.features.external.engines import ExternalEngine, same_state
+from rigidmd.features.external.engines import (
+    ExternalEngine,
+    not_finite,
+    same_state,
+    tallies_of,
+)
 from rigidmd.features.external.lammps import files
 from rigidmd.features.external.lammps.ellipsoids import atoms, ellipsoids
 from rigidmd.features.external.lammps.program import PROGRAM
@@ -101,7 +106,7 @@ class LammpsEngine(ExternalEngine):
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
         self._send(state)
         load, tallies = self._evaluated
-        return Load(load.force.copy(), load.torque_body.copy()), dict(tallies)
+        return Load(*map(np.copy, load)), dict(tallies)
 
     def memory(self) -> dict[str, np.ndarray]:
         """Nothing: a resumed run sends the state to LAMMPS again, and its thermostat and barostat
@@ -176,7 +181,7 @@ class LammpsEngine(ExternalEngine):
         )
         cell, rows = read_dump(self._process.folder / DUMP)
         if not (np.isfinite(rows).all() and np.isfinite(printed).all()):
-            raise NotFiniteError(state._replace(position=np.full_like(state.position, np.nan)))
+            raise not_finite(state)
         cell = cell if view.is_periodic else state.cell
         position = rows[:, 1:4] + (rows[:, 4:7] @ cell if view.is_periodic else 0.0)
         received = self._bodies.state(state, position, rows[:, 7:10] * PER_PS, cell)
@@ -209,10 +214,9 @@ class LammpsEngine(ExternalEngine):
         """Energies by the names of rigidmd's terms, without the constants of single charges."""
         view = self._view
         charge = view.charge * np.sqrt(files.COULOMB_REAL * files.KCAL)  # with LAMMPS' constant
-        names = [*body_pairs_of(view.system)]
-        others = len(self._styles) - len(names) - (view.coulomb is not None)
-        names += ["lennard_jones"] * others
         potential = view.coulomb
+        names = [*body_pairs_of(view.system)]
+        names += ["lennard_jones"] * (len(self._styles) - len(names) - (potential is not None))
         names += (
             ["coulomb_real", "coulomb_reciprocal"]
             if view.has_ewald_sum
@@ -228,10 +232,7 @@ class LammpsEngine(ExternalEngine):
             energies["coulomb"] -= (
                 0.5 * potential.shift - potential.alpha / np.sqrt(np.pi)
             ) * float(charge @ charge)
-        return {
-            name: Tally(float(u), np.zeros((3, 3)) if k else virial)
-            for k, (name, u) in enumerate(energies.items())
-        }
+        return tallies_of(energies, virial)
 
 
 class Process:
@@ -278,10 +279,8 @@ class Process:
         messages = [line for line in output if "ERROR" in line] or [
             line for line in output if line
         ][-3:]
-        if any(line.startswith("run ") and line != "run 0" for line in lines):
-            kind = SimulationError
-        else:
-            kind = EngineError
+        moves = any(line.startswith("run ") and line != "run 0" for line in lines)
+        kind = SimulationError if moves else EngineError
         raise kind(f"LAMMPS stopped: {'; '.join(messages) or f'exit code {self._process.wait()}'}")
 
     def close(self) -> None:

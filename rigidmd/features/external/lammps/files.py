@@ -56,6 +56,14 @@ POINTS = "points"
 FROZEN = "frozen"
 SITES = "sites"
 
+
+def ranks_without_molecules(view: ForceFieldView) -> str:
+    """How many ranks a scene has for how many molecules, if for too few of them."""
+    ranks = view.scene.engine.options.get("ranks", 1)
+    molecules = len(view.system.model.species)
+    return f"{ranks} ranks for {molecules} molecules" if ranks > molecules else ""
+
+
 _INTEGRATOR, *_LIMITS = moves("LAMMPS", "rigid bodies")
 #: What LAMMPS can express, and how.
 TRANSLATIONS = Translations(
@@ -127,7 +135,7 @@ TRANSLATIONS = Translations(
         ),
         Limit(
             "engine.ranks: {}, some would have nothing to move. Use fewer",
-            lambda view: _ranks_without_molecules(view),
+            ranks_without_molecules,
         ),
     ),
     stage_limits=(
@@ -139,12 +147,6 @@ TRANSLATIONS = Translations(
     ),
     body_pairs={GayBerne: limits},
 )
-
-
-def _ranks_without_molecules(view: ForceFieldView) -> str:
-    ranks = view.scene.engine.options.get("ranks", 1)
-    molecules = len(view.system.model.species)
-    return f"{ranks} ranks for {molecules} molecules" if ranks > molecules else ""
 
 
 class PairStyle(NamedTuple):
@@ -317,11 +319,9 @@ def _lennard_jones(view: ForceFieldView) -> PairStyle | None:
     coefficients = {
         (i, j): f"{_num(view.epsilon[i, j] / KCAL)} {_num(view.sigma[i, j])}" for i, j in pairs
     }
-    if view.truncation == "shift" and potential.cutoff < inf:
-        shifts = f"pair_modify pair {name} shift yes"
-    else:
-        shifts = ""
-    return PairStyle(name, arguments, coefficients, modify=shifts)
+    is_shifted = view.truncation == "shift" and potential.cutoff < inf
+    modify = f"pair_modify pair {name} shift yes" if is_shifted else ""
+    return PairStyle(name, arguments, coefficients, modify=modify)
 
 
 def _coulomb(view: ForceFieldView) -> PairStyle | None:

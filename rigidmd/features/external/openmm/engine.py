@@ -14,7 +14,12 @@ from rigidmd.engines.observables import kinetic_energies
 from rigidmd.engines.protocol import NotFiniteError, Tally
 from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SimulationError
-from rigidmd.features.external.engines import ExternalEngine, same_state
+from rigidmd.features.external.engines import (
+    ExternalEngine,
+    not_finite,
+    same_state,
+    tallies_of,
+)
 from rigidmd.features.external.openmm.program import FIXED_PRECISIONS, PLATFORMS, precision_of
 from rigidmd.features.external.openmm.system import (
     NM,
@@ -121,9 +126,7 @@ class OpenmmEngine(ExternalEngine):
             step(self._integrator, steps)
         except library().OpenMMException as error:
             if "NaN" in str(error):
-                raise NotFiniteError(
-                    state._replace(position=np.full_like(state.position, np.nan))
-                ) from None
+                raise not_finite(state) from None
             raise SimulationError(f"OpenMM stopped: {error}") from None
 
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
@@ -146,7 +149,7 @@ class OpenmmEngine(ExternalEngine):
                 self._tallies(state, virial),
             )
         _, load, tallies = self._evaluated
-        return Load(load.force.copy(), load.torque_body.copy()), dict(tallies)
+        return Load(*map(np.copy, load)), dict(tallies)
 
     def memory(self) -> dict[str, np.ndarray]:
         """OpenMM's checkpoint of the context: particles, random numbers, thermostat."""
@@ -193,11 +196,10 @@ class OpenmmEngine(ExternalEngine):
         position = had.getPositions(asNumpy=True)._value[point] * ANGSTROM
         velocity = had.getVelocities(asNumpy=True)._value[point] * ANGSTROM
         if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
-            raise NotFiniteError(state._replace(position=np.full_like(state.position, np.nan)))
+            raise not_finite(state)
+        cell = state.cell
         if self._stage.has_barostat:
             cell = had.getPeriodicBoxVectors(asNumpy=True)._value * ANGSTROM
-        else:
-            cell = state.cell
         received = self._particles.bodies.state(state, position, velocity, cell)
         # OpenMM wraps molecules into the box whenever it changes the box
         if self._stage.has_barostat:
@@ -225,12 +227,11 @@ class OpenmmEngine(ExternalEngine):
         def energy(group: int) -> float:
             return _energy_of(self._evaluating_context, {group})
 
+        energies = {}
         if Group.LENNARD_JONES in self._groups:
-            energies = {"lennard_jones": energy(Group.LENNARD_JONES)}
-        else:
-            energies = {}
+            energies["lennard_jones"] = energy(Group.LENNARD_JONES)
         view = self._view
-        potential = self._view.coulomb
+        potential = view.coulomb
         if isinstance(potential, ScreenedCoulomb):
             alpha = potential.alpha
             charge = view.charge * COULOMB_CHARGE
@@ -247,10 +248,7 @@ class OpenmmEngine(ExternalEngine):
                 energies["coulomb_background"] = even
         elif potential is not None:
             energies["coulomb"] = energy(Group.COULOMB_PAIRS)
-        return {
-            name: Tally(float(u), np.zeros((3, 3)) if k else virial)
-            for k, (name, u) in enumerate(energies.items())
-        }
+        return tallies_of(energies, virial)
 
     def _excluded_energy(self, state: State, alpha: float) -> float:
         """The reciprocal energy of excluded pairs, which OpenMM subtracts."""

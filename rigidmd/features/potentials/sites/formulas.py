@@ -145,7 +145,7 @@ def formula_of_function(function: Callable, kind: type | None = None) -> Formula
         raise FormulaError(f"{function!r:.60} is not a function of Python, made by def or lambda")
     arguments = list(inspect.signature(function).parameters.values())
     strange = [one.name for one in arguments[1:] if one.name not in ARGUMENTS]
-    if not arguments or len(arguments) < 2 or strange:
+    if len(arguments) < 2 or strange:
         raise FormulaError(
             f"{name} has the arguments ({', '.join(one.name for one in arguments)}). It needs the"
             " parameters, then r, and may have r2 and inverse"
@@ -207,7 +207,7 @@ def _class_for(kind: type, function: Callable) -> type:
         f"{name}_{next(_COUNT)}"
     )
     compiled = compile_user_function(function, inline=True)
-    asked = tuple(name for name in list(inspect.signature(function).parameters)[1:])
+    asked = list(inspect.signature(function).parameters)[1:]
     values = {"r": "r2 * inverse1", "r2": "r2", "inverse": "inverse1"}
     source = (
         "def energy_and_force_at(formula, shared, r2, inverse1, inverse2):\n"

@@ -204,10 +204,9 @@ class BoundForce:
     def _parts(self, returned: object, largest: int) -> list:
         """Energy and three further values, None for omitted ones."""
         if not isinstance(returned, tuple) or not 2 <= len(returned) <= largest:
+            kind = type(returned).__name__
             if isinstance(returned, tuple):
                 kind = f"{len(returned)} values"
-            else:
-                kind = f"{type(returned).__name__}"
             optional = (
                 " and perhaps torques and a virial" if largest == 4 else " and perhaps a virial"
             )

@@ -68,13 +68,12 @@ def conclusions(results: Results) -> list[str]:
     failures = [result.failure for result in results if result.failure]
     unexpected = [_unexpected(result) for result in results if result.is_unexpected]
     counts = verdict_counts(results)
-    verdicts = ", ".join(f"{count} {verdict}" for verdict, count in counts.items())
     runs = sum(counts.values())
     cases = len({result.case.name for result in results})
     warnings = sum(len(result.warnings) for result in results)
     bisected = len(results) - runs
     good = runs - sum(bool(result.failure) for result in results if result.limit is None)
-    parts = [f"{good} of {runs} runs in {cases} case{'s' * (cases > 1)}", verdicts]
+    parts = [f"{good} of {runs} runs in {cases} case{'s' * (cases > 1)}", _described(counts)]
     parts += [f"{bisected} longest steps bisected"] * bool(bisected)
     parts += [f"{warnings} warnings, which -v lists"] * bool(warnings)
     total = f"{'failed' if failures else 'passed'}: {'; '.join(filter(None, parts))}"
@@ -93,6 +92,10 @@ def verdict_counts(results: Results) -> dict[str, int]:
     """Numbers of runs by their verdicts, in the order of VERDICTS."""
     counts = Counter(result.verdict for result in results)
     return {verdict: counts[verdict] for verdict in VERDICTS if counts[verdict]}
+
+
+def _described(counts: dict[str, int]) -> str:
+    return ", ".join(f"{count} {verdict}" for verdict, count in counts.items())
 
 
 def grouped(results: Results, key: Callable[[TrialResult], Hashable]) -> list[Results]:
@@ -120,7 +123,7 @@ def _row(results: Results) -> list[str]:
         case.name,
         results[0].integrator or "-",
         str(sum(counts.values())),
-        ", ".join(f"{count} {verdict}" for verdict, count in counts.items()),
+        _described(counts),
         format_cell(worst and worst.outcome.error),
         format_cell(worst and worst.allowed),
         *_limit_cells(results, case.step_unit),

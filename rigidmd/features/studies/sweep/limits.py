@@ -183,16 +183,17 @@ class Limits(NamedTuple):
         lines = []
         for limit in self.limits:
             fit = limit.fit
-            line = key_cells(limit.values)
-            line["average"] = limit.quantity
-            line["fit"] = limit.kind
-            line["integrator"] = limit.integrator
-            line["order"] = limit.order
-            line["limit"] = nine_digits(fit.limit)
-            line["limit error"] = nine_digits(fit.limit_error)
-            line["chi2"] = nine_digits(fit.chi2) if fit.freedom else None
-            line["degrees of freedom"] = fit.freedom
-            line["longest step in fit (fs)"] = fit.longest
+            line = key_cells(limit.values) | {
+                "average": limit.quantity,
+                "fit": limit.kind,
+                "integrator": limit.integrator,
+                "order": limit.order,
+                "limit": nine_digits(fit.limit),
+                "limit error": nine_digits(fit.limit_error),
+                "chi2": nine_digits(fit.chi2) if fit.freedom else None,
+                "degrees of freedom": fit.freedom,
+                "longest step in fit (fs)": fit.longest,
+            }
             for step in self.steps:
                 name = f"bias at {step:g} fs"
                 bias, error = limit.bias(step) or (None, None)
