@@ -134,7 +134,7 @@ def build_body(
 @np.errstate(over="ignore", invalid="ignore")
 def has_finite_energy(system: BodySystem) -> bool:
     """Whether the energies of a body at its start are numbers."""
-    return all(np.isfinite(energy) for energy in energies_of(system, system.state).values())
+    return all(map(np.isfinite, energies_of(system, system.state).values()))
 
 
 def _first_state(scene, body, moments, axes, attitude, spin, rotates) -> State:

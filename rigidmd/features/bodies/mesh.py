@@ -42,8 +42,8 @@ class Mesh(NamedTuple):
 def mesh_of(system: BodySystem) -> Mesh:
     """The surface of a body: as the scene requests, its solids, its points joined, or a body of
     equal inertia."""
-    table = system.scene.body
     scene = system.scene
+    table = scene.body
     mass, _, centre, _, _ = inertia_of(scene)
     wanted = scene.output.drawn_as
     if wanted is None and table.points is not None:

@@ -7,7 +7,7 @@ of space groups, and types that are not elements. So the module `crystal` applie
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -138,6 +138,11 @@ def number_of(text: str | None) -> tuple[float, float]:
     return float(match[1]), int(match[4] or 0) / 10**digits
 
 
+def numbers_of(texts: Iterable[str | None]) -> np.ndarray:
+    """The numbers (n,) of texts, as of `number_of`."""
+    return np.array([number_of(text)[0] for text in texts])
+
+
 def read_cif(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
     """The structures of a file: its data blocks with atoms, and the models in them."""
     blocks, notes = parse_cif(path, lines, _is_read)
@@ -179,7 +184,8 @@ def _structure(path: Path, block: Block, rows: list[int], syntax: list[str]) -> 
         contents = unit_cell(position, kinds, _radii(kinds), operations, cell)
     except NoSymmetry as error:
         reason = "its atoms are disordered, or have another symmetry than it states"
-        raise structure_error(path, f"{error} in the cell: {reason}{_as_read(notes)}") from None
+        as_read = f" ({'; '.join(notes)})" if notes else ""
+        raise structure_error(path, f"{error} in the cell: {reason}{as_read}") from None
     owner = contents.source_atom
     order = len(operations) if operations else 1
     notes += _contents(block, kinds, contents, cell, order)
@@ -192,10 +198,6 @@ def _structure(path: Path, block: Block, rows: list[int], syntax: list[str]) -> 
         notes=notes,
         charges=None if (charges := sites.charges(path)) is None else charges[owner],
     )
-
-
-def _as_read(notes: list[str]) -> str:
-    return f" ({'; '.join(notes)})" if notes else ""
 
 
 class AtomSites:
@@ -229,7 +231,7 @@ class AtomSites:
         texts = self.column("charge")
         if not any(texts):
             return None
-        charges = np.array([number_of(text)[0] for text in texts])
+        charges = numbers_of(texts)
         if len(bad := np.flatnonzero(np.isnan(charges))):
             name, found = self.names()[0][bad[0]], texts[bad[0]] or "none"
             what = "a number, as other atoms have"
@@ -343,7 +345,7 @@ def _check_order(path: Path, sites: AtomSites) -> None:
 def _coordinates(path: Path, sites: AtomSites, names: list[str], axes: str) -> np.ndarray:
     """Coordinates (n, 3), fractional or in Å."""
     columns = [sites.column(f"{axes}_{x}") for x in "xyz"]
-    position = np.array([[number_of(text)[0] for text in column] for column in columns]).T
+    position = np.array([numbers_of(column) for column in columns]).T
     if len(bad := np.flatnonzero(np.isnan(position).any(axis=1))):
         words = " ".join(str(column[bad[0]]) for column in columns)
         raise structure_error(
@@ -358,11 +360,10 @@ def _cell(path: Path, block: Block) -> np.ndarray | None:
     texts = [block.first(tag) for tag in CELL]
     if not any(texts):
         return None
-    if missing := [
-        tag for tag, text in zip(CELL, texts, strict=True) if np.isnan(number_of(text)[0])
-    ]:
+    numbers = numbers_of(texts)
+    if missing := [tag for tag, x in zip(CELL, numbers, strict=True) if np.isnan(x)]:
         raise structure_error(path, f"its cell is incomplete: {', '.join(missing)} is not a number")
-    cell = cell_of([number_of(text)[0] for text in texts])
+    cell = cell_of(numbers.tolist())
     if cell is None:
         raise structure_error(path, f"no cell has the edges and angles {' '.join(map(str, texts))}")
     if error := cell_error(cell):
@@ -378,8 +379,7 @@ def _to_fractional(block: Block, position: np.ndarray, cell: np.ndarray) -> np.n
         [block.first(f"_atom_sites_fract_transf_matrix[{i}][{j}]") for j in "123"] for i in "123"
     ]
     shift = [block.first(f"_atom_sites_fract_transf_vector[{i}]") for i in "123"]
-    w = np.array([[number_of(text)[0] for text in row] for row in matrix])
-    t = np.array([number_of(text)[0] for text in shift])
+    w, t = np.array([numbers_of(row) for row in matrix]), numbers_of(shift)
     if np.isnan(w).any() or np.isnan(t).any():
         return position @ standard.T
     is_standard = np.abs(w - standard).max() <= SAME_MATRIX * np.abs(standard).max() and not t.any()

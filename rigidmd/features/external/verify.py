@@ -125,12 +125,10 @@ class Verification(NamedTuple):
 
     def description(self) -> str:
         name = self.other.split()[0]
-        parts = [f"{self.scene}: rigidmd and {self.other} at the start"]
-        parts += [
+        parts = [
+            f"{self.scene}: rigidmd and {self.other} at the start",
             describe_comparison(self.start, name),
             f"after {STEPS} steps of {STEP:g} fs at constant energy",
-        ]
-        parts += [
             describe_comparison(self.run, name),
             "they agree" if self.agrees else "they do NOT agree",
         ]

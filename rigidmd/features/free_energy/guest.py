@@ -24,7 +24,7 @@ from rigidmd.features.potentials.extra import body_pairs_of
 from rigidmd.features.potentials.user_code.binding import with_user_code
 from rigidmd.forces.ewald.direct_sum import SAME_BASIS
 from rigidmd.forces.neighbors.pair_loop import PairForces
-from rigidmd.forces.parts import Grid, SystemParts
+from rigidmd.forces.parts import SystemParts
 from rigidmd.forces.terms import trait
 from rigidmd.scene.models import Molecule, load_model, read_molecule
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
@@ -207,11 +207,10 @@ def _reassembled(system: System, host: np.ndarray, added: list[Molecule]) -> Sys
         forces = scene.forces.model_copy(update={"electrostatics": "none"})
         scene = scene.model_copy(update={"forces": forces})
     number = np.append(system.residue_number[host], np.ones(len(added), int))
-    parts = SystemParts(
-        scene, species, model, system.space, state, number, SAME_BASIS, _grid_of(system)
-    )
+    reciprocal = system.terms.get("coulomb_reciprocal")
+    grid, k_vectors = (getattr(reciprocal, name, None) for name in ("grid", "k_vectors"))
+    parts = SystemParts(scene, species, model, system.space, state, number, SAME_BASIS, grid)
     acting = interactions(parts)
-    k_vectors = getattr(system.terms.get("coulomb_reciprocal"), "k_vectors", None)
     if k_vectors is not None and "coulomb_reciprocal" in acting.terms:
         term = acting.terms["coulomb_reciprocal"]._replace(k_vectors=k_vectors)  # type: ignore[attr-defined]
         acting.terms["coulomb_reciprocal"] = term
@@ -231,10 +230,6 @@ def _reassembled(system: System, host: np.ndarray, added: list[Molecule]) -> Sys
     if scene.forces.added or scene.from_python:
         return with_user_code(made, is_start=False)
     return made
-
-
-def _grid_of(system: System) -> Grid | None:
-    return getattr(system.terms.get("coulomb_reciprocal"), "grid", None)
 
 
 def _engine_of(system: System, names: list[str]) -> CpuEngine:

@@ -100,14 +100,13 @@ def results_of_samples(density: np.ndarray, series: Series, at: Conditions) -> R
     changes = (table - table.mean(axis=0)) * sqrt((BLOCKS - 1) / BLOCKS)
     errors = dict(zip(found, np.linalg.norm(changes, axis=0).tolist(), strict=True))
     errors |= {name: mean_and_error(values)[1] for name, values in observed.items()}
-    known = all(map(_is_long, observed.values()))
+    # enough independent samples for the fluctuations of each
+    known = all(
+        len(values) >= LEAST_SAMPLES * inefficiency(values - values.mean())
+        for values in observed.values()
+    )
     errors = {name: error if known else None for name, error in errors.items()}
     return RunResults(found, errors, changes, len(density))
-
-
-def _is_long(series: np.ndarray) -> bool:
-    """Whether a series has enough independent samples for its fluctuations."""
-    return len(series) >= LEAST_SAMPLES * inefficiency(series - series.mean())
 
 
 def _observables(at: Conditions) -> list[str]:

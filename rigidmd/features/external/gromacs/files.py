@@ -161,9 +161,9 @@ def write_gromacs(folder: Path, view: ForceFieldView, state: State) -> list[str]
     before = f"-c {COORDINATES}"
     for name in map(quote, names):
         script += [
-            f"gmx grompp -f {name}.mdp {before} -p {TOPOLOGY} -po {name}_all.mdp -o {name}.tpr"
+            f"gmx grompp -f {name}.mdp {before} -p {TOPOLOGY} -po {name}_all.mdp -o {name}.tpr",
+            f'gmx mdrun -deffnm {name} "$@"',
         ]
-        script += [f'gmx mdrun -deffnm {name} "$@"']
         before = f"-c {name}.gro -t {name}.cpt"
     text = {
         COORDINATES: _coordinates(view, bodies, state),
@@ -192,8 +192,7 @@ def _coordinates(view: ForceFieldView, bodies: list[MassPoints], state: State) -
     )
     width = DECIMALS + 5
     rows = []
-    s = 0
-    e = 0
+    s = e = 0
     for n, k in enumerate(species):
         m = system.species[k]
         added = bodies[k].extra
@@ -337,9 +336,8 @@ def _coulomb(view: ForceFieldView) -> dict[str, object]:
         settings["coulomb-modifier"] = "Potential-shift" if potential.shift else "None"
         # GROMACS needs one cutoff; rtol is that of alpha there
         settings["ewald-rtol"] = f"{float(erfc(potential.alpha * view.system.cutoff)):.12g}"
-        settings |= {f"fourier-n{axis}": n for axis, n in zip("xyz", mesh.grid, strict=True)} | {
-            "pme-order": mesh.order
-        }
+        settings |= {f"fourier-n{axis}": n for axis, n in zip("xyz", mesh.grid, strict=True)}
+        settings["pme-order"] = mesh.order
     elif isinstance(potential, ReactionField):
         permittivity = view.system.scene.forces.reaction_field_permittivity
         settings["epsilon-rf"] = 0 if permittivity == inf else f"{permittivity:.12g}"
@@ -364,8 +362,8 @@ def _couplings(stage: Stage) -> dict[str, object]:
             "annealing": "single",
             "annealing-npoints": 2,
             "annealing-time": f"0 {stage.duration:.12g}",
+            "annealing-temp": f"{first:.12g} {last:.12g}",
         }
-        settings["annealing-temp"] = f"{first:.12g} {last:.12g}"
     if stage.has_barostat:
         pressure = stage.pressures[0]
         count = 1 if stage.pressure_coupling == "isotropic" else 2

@@ -229,7 +229,7 @@ def _num(number: SupportsFloat) -> str:
 def settings(view: ForceFieldView, data: str = DATA) -> list[str]:
     """The commands that define the system and its forces, without fixes that move it."""
     system = view.system
-    forces = view.system.scene.forces
+    forces = system.scene.forces
     boundary = "p p p" if view.is_periodic else "s s s"
     styles = pair_styles(view)
     names = (
@@ -265,8 +265,8 @@ def settings(view: ForceFieldView, data: str = DATA) -> list[str]:
     lines += [
         f"neighbor 2.0 {'bin' if view.is_periodic else 'nsq'}",
         "neigh_modify every 1 delay 0 check yes",
+        "neigh_modify exclude molecule/intra all",
     ]
-    lines += ["neigh_modify exclude molecule/intra all"]
     for name, members in (
         (BODIES, view.is_body),
         (POINTS, ~view.is_body & ~view.frozen),
@@ -449,7 +449,7 @@ def _barostat(view: ForceFieldView, stage: Stage) -> str:
 def input_script(view: ForceFieldView) -> str:
     """The input script of the whole run: settings, and all stages except minimisations."""
     system = view.system
-    output = view.system.scene.output
+    output = system.scene.output
     hint = (
         "# Written by rigidmd. Run it here:  lmp -in in.lammps   or   mpirun -n 4 lmp -in in.lammps"
     )
@@ -482,8 +482,9 @@ def input_script(view: ForceFieldView) -> str:
             "",
             f"# {in_comment(stage.label)}: {stage.duration:g} ps",
             f"timestep {_num(stage.step_fs)}",
+            *stage_fixes,
+            f"thermo {every}",
         ]
-        lines += [*stage_fixes, f"thermo {every}"]
         if output.trajectory:
             lines += [
                 f"dump frames {SITES if ellipsoids(view) else 'all'} custom {frames}"

@@ -154,7 +154,11 @@ class Traced:
             return NotImplemented
         numbers = [value for value in inputs if not isinstance(value, np.ndarray)]
         if len(numbers) < len(inputs):
-            return _each(ufunc, *(np.array(value, object) for value in inputs))
+            arrays = np.broadcast_arrays(*(np.array(value, object) for value in inputs))
+            result = np.empty(arrays[0].shape, object)
+            for at in np.ndindex(*result.shape):
+                result[at] = ufunc(*(array[at] for array in arrays))
+            return result
         name = ufunc.__name__
         if name in _OPERATORS:
             return _OPERATORS[name](*map(self._other, numbers))
@@ -182,14 +186,6 @@ class Traced:
 
 #: A number that is recorded, or a constant.
 Number = Traced | float
-
-
-def _each(function: Callable, *arrays: np.ndarray) -> np.ndarray:
-    spread = np.broadcast_arrays(*arrays)
-    result = np.empty(spread[0].shape, object)
-    for at in np.ndindex(*result.shape):
-        result[at] = function(*(array[at] for array in spread))
-    return result
 
 
 def choose(condition: Number, yes: Number, no: Number) -> Number:

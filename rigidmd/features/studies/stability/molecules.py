@@ -109,16 +109,12 @@ def water_at(trial: Trial, temperature: float) -> State:
             steps=steps,
             state=None if is_first else water_at(trial, 298.0),
         )
-        state = finish(preparation, "velocity_verlet", _ignore, step).state
+        state = finish(preparation, "velocity_verlet", lambda warning: None, step).state
         if is_frozen:
             state.velocity[:] = 0.0
             state.angular_momentum_body[:] = 0.0
         STATES[key] = state
     return STATES[key]
-
-
-def _ignore(warning: str) -> None:
-    """Leave out the warnings of a preparation."""
 
 
 @builder

@@ -193,9 +193,8 @@ def clear_sweep(folder: Path, names: Iterable[str]) -> None:
         if not run_or_sweep_folder.is_dir():
             continue
         with writing(run_or_sweep_folder, "cleared"):
-            for path in (
-                run_or_sweep_folder / name for name in written_by_runs(run_or_sweep_folder)
-            ):
+            for name in written_by_runs(run_or_sweep_folder):
+                path = run_or_sweep_folder / name
                 for written in (path, *offsets_of(path)):
                     written.unlink(missing_ok=True)
             (run_or_sweep_folder / MARKER).unlink(missing_ok=True)
