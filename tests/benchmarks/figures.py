@@ -96,7 +96,7 @@ def modes(folder: Path, images: Path) -> None:
 
 def slab(folder: Path, images: Path) -> None:
     """The density of water about the middle of a slab, and the fit."""
-    equilibration, production = (0.05, 0.2) if SMOKE else (20.0, 100.0)
+    equilibration, production = (1.0, 0.4) if SMOKE else (20.0, 100.0)
     changes = {
         "stages.equilibration.duration_ps": equilibration,
         "stages.production.duration_ps": production,
