@@ -16,10 +16,13 @@ from rigidmd.compile.code import CompiledTask, addresses_of, arguments_type
 from rigidmd.compile.kernels import kernel
 from rigidmd.compile.machine import MOST_BLOCKS
 from rigidmd.compile.records import NumbaStruct
-from rigidmd.compile.stopwatch import measure_block
 from rigidmd.compile.thread_pool import (
+    ADDRESS,
     AFTER,
+    ARGUMENTS,
     AT_ONCE,
+    BEGINS,
+    BLOCKS,
     COLUMNS,
     MOST_ROWS,
     WITH,
@@ -49,10 +52,6 @@ class Pass(NamedTuple):
     # neighbouring passes with the same number are one job, in which chains run at the same time
     job: int = ALONE
     chain: int = 0
-
-    def in_job(self, job: int, chain: int) -> "Pass":
-        """The pass in a job and a chain."""
-        return self._replace(job=job, chain=chain)
 
 
 class Rows(NamedTuple):
@@ -121,6 +120,8 @@ class Program:
     def measure(self) -> np.ndarray:
         """Measure all blocks from now on. Returns the array (rows, blocks, 8) to whose [..., 0]
         their times are added, ns; threads write to different cache lines."""
+        from rigidmd.compile.stopwatch import measure_block  # for profiles only
+
         if self._spent is None:
             self._unmeasured = self.rows.address.copy()
             self._spent = np.zeros((len(self._unmeasured), MOST_BLOCKS, 8), int)
@@ -179,11 +180,11 @@ def run_passes(rows, arguments, when):
                 return rows.status[0]
         else:
             row = rows.table[count]
-            row[0], row[1], row[2] = rows.address[k], arguments[k], rows.blocks[k]
-            row[3] = AT_ONCE
+            row[ADDRESS], row[ARGUMENTS] = rows.address[k], arguments[k]
+            row[BLOCKS], row[BEGINS] = rows.blocks[k], AT_ONCE
             if count > 0 and rows.chain[k] == chain:
-                has_same_blocks = row[2] == rows.table[count - 1, 2]
-                row[3] = WITH if chain == JOINED and has_same_blocks else AFTER
+                has_same_blocks = row[BLOCKS] == rows.table[count - 1, BLOCKS]
+                row[BEGINS] = WITH if chain == JOINED and has_same_blocks else AFTER
             count += 1
         job, chain = rows.job[k], rows.chain[k]
     _run_collected(rows, count)

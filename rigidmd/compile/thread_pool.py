@@ -80,7 +80,8 @@ ALLOCATE, ACQUIRE, RELEASE = (
     "PyThread_release_lock",
 )
 #: Time in seconds for which a waiting thread polls before it sleeps: longer than the time between
-#: two jobs, and too short to disturb other programs.
+#: two jobs, and too short to disturb other programs. With 1 ms, steps of 4096 and 216 waters with
+#: PME take as long on two idle cores, but 1.21 and 1.26 times as long if a program has one of them.
 POLLING_TIME = 50e-6
 
 

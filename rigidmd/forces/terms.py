@@ -229,11 +229,13 @@ def in_order(passes: Sequence[tuple[str, TermPasses]]) -> list[tuple[str, Pass]]
             chains = sorted(reversed(chains), key=_number_without_energies, reverse=True)
             has_blocks = any(one.blocks > 1 for _, chain in chains for one in chain)
             for k, (name, chain) in enumerate(chains):
-                rows += [(name, one.in_job(job, k) if has_blocks else one) for one in chain]
+                rows += [
+                    (name, one._replace(job=job, chain=k) if has_blocks else one) for one in chain
+                ]
         else:
             joins = field == "loads"
             rows += [
-                (name, one.in_job(job, JOINED) if joins and one.blocks > 1 else one)
+                (name, one._replace(job=job, chain=JOINED) if joins and one.blocks > 1 else one)
                 for name, chain in chains
                 for one in chain
             ]
@@ -284,7 +286,7 @@ class TermDispatcher:
         self._tallies, self._power = np.zeros((len(workspaces), TALLY_SIZE)), np.zeros(1)
         self._status, valid = np.zeros((2, 1), np.int64)
         self._with_rates = with_rates
-        self.program = Program(self.passes(workspaces, *EXAMPLE), uses, self._status)
+        self.program = Program(self._passes(workspaces, *EXAMPLE), uses, self._status)
         self._rates = Program(
             self._rate_passes(workspaces, EXAMPLE[0]), ALWAYS, np.zeros(1, np.int64)
         )
@@ -303,7 +305,7 @@ class TermDispatcher:
             target[:] = source
         return self._copy_and_load
 
-    def passes(self, workspaces: tuple[NamedTuple, ...], state: State, load: Load) -> list[Pass]:
+    def _passes(self, workspaces: tuple[NamedTuple, ...], state: State, load: Load) -> list[Pass]:
         """The passes of the terms, in the order in which they run."""
         passes = [
             ("", trait(workspace, "passes")(Evaluation(state, load, tally, self._status)))
@@ -331,10 +333,10 @@ class TermDispatcher:
         are unchanged."""
         bound_to = (*workspaces, *state, *load, *(other or ()))
         if list(map(id, bound_to)) != list(map(id, self._bound_to)):
-            self.program.bind(self.passes(workspaces, state, load))
+            self.program.bind(self._passes(workspaces, state, load))
             self._rates.bind(self._rate_passes(workspaces, state))
             if other is not None:
-                self.program.bind(self.passes(workspaces, state, other), self.table.elsewhere)
+                self.program.bind(self._passes(workspaces, state, other), self.table.elsewhere)
             self._bound_to = bound_to
         return self.table
 

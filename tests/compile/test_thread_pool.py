@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from support.common import ROOT, same_bits, small_scene
 from support.processes import search_path
-from support.thread_kernels import count_blocks, counted, run_blocks
+from support.thread_kernels import count_blocks, counted, meet, run_blocks
 
 from rigidmd import Every, Simulation, run_together
 from rigidmd.commands.cli import main
@@ -35,16 +35,19 @@ from rigidmd.compile import (
 )
 from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.compile.thread_pool import (
+    ADDRESS,
+    ARGUMENTS,
     BEGUN,
+    BLOCKS,
     FIRST_ROW,
+    JOB,
     MOST_ROWS,
     ROW,
+    STATUS,
+    ZERO,
     _add,
-    _begin_range,
-    _pause,
     _pool,
-    _read,
-    _write,
+    _run_ranges_of_row,
 )
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.errors import SimulationError
@@ -88,32 +91,43 @@ def test_every_block_is_done_once_by_many_more_threads():
     assert done.returncode == 0, done.stderr
 
 
+@task()
+def _note(task_arguments, block):
+    order = load_arguments(task_arguments)
+    order[0] += 1
+    order[order[0]] = block
+
+
 @kernel(from_python=True)
-def _begin_all(cells, job, ranges, at, step):
-    """The ranges of the first row that a thread begins, in their order."""
-    found = []
-    at = _begin_range(cells, job, FIRST_ROW, ranges, at, step)
-    while at >= 0:
-        found.append(at)
-        at = _begin_range(cells, job, FIRST_ROW, ranges, at, step)
-    return found
+def _run_alone(cells, job, own, threads):
+    return _run_ranges_of_row(cells, job, 0, 1, own, threads)
 
 
 @pytest.mark.parametrize(
-    ("at", "step", "begun", "expected"),
+    ("own", "threads", "begun", "expected"),
     [
-        (0, 1, [0] * 6, [0, 1, 2, 3, 4, 5]),
-        (5, -1, [0] * 6, [5, 4, 3, 2, 1, 0]),
-        (0, 1, [0, 4, 2, 0, 4, 4], [0, 2, 3]),  # the others have begun
-        (4, 1, [0] * 6, [4, 5, 0, 1, 2, 3]),
-        (3, -1, [0] * 6, [3, 2, 1, 0, 5, 4]),
-        (5, -1, [4, 4, 6, 4, 8, 6], []),  # the job has ended, others have begun
+        (0, 2, [0] * 6, [0, 1, 2, 3, 4, 5]),
+        (1, 2, [0] * 6, [5, 4, 3, 2, 1, 0]),
+        (0, 2, [0, 4, 2, 0, 4, 4], [0, 2, 3]),  # the others have begun
+        (2, 3, [0] * 6, [4, 5, 0, 1, 2, 3]),
+        (1, 3, [0] * 6, [3, 2, 1, 0, 5, 4]),
+        (1, 2, [4, 4, 6, 4, 8, 6], []),  # the job has ended, others have begun
+        (3, 8, [0] * 6, [2, 1, 0, 5, 4, 3]),  # more threads than blocks
+        (1, 16, [0] * 6, [0, 5, 4, 3, 2, 1]),  # more than twice as many
     ],
 )
-def test_a_thread_continues_with_what_is_left(at, step, begun, expected):
-    cells = np.zeros(FIRST_ROW + ROW, np.int64)
+def test_each_thread_begins_with_its_fraction_and_continues_with_what_is_left(
+    own, threads, begun, expected
+):
+    cells, order = np.zeros(FIRST_ROW + ROW, np.int64), np.zeros(7, np.int64)
+    code = Code(note=(_note, order))
+    struct = code.to_struct(order)
+    cells[JOB], cells[STATUS] = 4, cells.ctypes.data + 8 * ZERO
+    cells[FIRST_ROW:][[ADDRESS, ARGUMENTS, BLOCKS]] = code.address("note"), struct.address, 6
     cells[FIRST_ROW + BEGUN :][:6] = begun
-    assert list(_begin_all(cells.ctypes.data, 4, 6, at, step)) == expected
+    assert _run_alone(cells.ctypes.data, 4, own, threads) == (len(expected), False)
+    assert order[1 : order[0] + 1].tolist() == expected
+    assert _run_alone(cells.ctypes.data, 2, own, threads) == (0, True)  # of an earlier job
 
 
 @task()
@@ -174,9 +188,11 @@ def test_passes_follow_those_of_their_chain_and_all_of_earlier_jobs(threads, wor
                     assert max(moments[before]) < min(moments[number])
                 if before < number and (job_before != job or job == 0):
                     assert max(moments[before]) < min(moments[number])
-        for block in range(6):  # joined: on one thread, one after the other
+        for block in range(6):
             first, second = (lines.tolist().index([number, block]) for number in (11, 12))
-            assert first < second
+            assert second == first + 1 if threads == 1 else first < second
+        if threads < 6:  # joined: a thread begins no second block before it has ended the first
+            assert min(moments[12]) < max(moments[11])
         assert max(moments[12]) < min(moments[13])  # it has other blocks
 
 
@@ -190,19 +206,6 @@ def test_random_jobs_run_each_block_once_in_its_order(threads, callers, polls):
     assert (done.returncode, done.stderr) == (0, "")
 
 
-@task()
-def _meet(task_arguments, block):
-    """Wait until the other of two passes has begun, and note whether it has."""
-    which, begun, most = load_arguments(task_arguments)
-    cells = begun.ctypes.data
-    _write(cells, which, 1)
-    polls = 0
-    while _read(cells, 1 - which) == 0 and polls < most:
-        polls += 1
-        _pause()
-    _write(cells, 2 + which, _read(cells, 1 - which))
-
-
 @pytest.mark.skipif(MOST_THREADS == 1, reason="one core")
 @pytest.mark.parametrize(("chains", "expected"), [((0, 1), [1, 1]), ((0, 0), [0, 1])])
 def test_two_chains_run_at_the_same_time_and_one_in_its_order(chains, expected):
@@ -210,7 +213,7 @@ def test_two_chains_run_at_the_same_time_and_one_in_its_order(chains, expected):
     begun = np.zeros(4, np.int64)
     most = 10**12 if chains == (0, 1) else 1000
     passes = [
-        Pass("", _meet, (which, begun, most), job=1, chain=chain)
+        Pass("", meet, (which, begun.ctypes.data, most), job=1, chain=chain)
         for which, chain in enumerate(chains)
     ]
     program = Program(passes, ALWAYS, np.zeros(1, np.int64))

@@ -38,24 +38,26 @@ def counted(blocks: int, work: int = 10, times: int = 1) -> np.ndarray:
 
 @task()
 def meet(task_arguments, block):
-    """Wait until the other of two blocks has begun, or for this many observations; note whether it has."""
-    at, most = load_arguments(task_arguments)
-    _write(at, block, 1)
+    """Wait until the other of two blocks has begun, or for this many observations; note whether it
+    has. `first` is added to the number of the block."""
+    first, at, most = load_arguments(task_arguments)
+    which = first + block
+    _write(at, which, 1)
     looks = 0
-    while _read(at, 1 - block) == 0 and looks < most:
+    while _read(at, 1 - which) == 0 and looks < most:
         looks += 1
         _pause()
-    _write(at, 2 + block, _read(at, 1 - block))
+    _write(at, 2 + which, _read(at, 1 - which))
 
 
 @kernel(from_python=True)
 def run_meeting(code, at, most):
-    call_blocks(code, "meet", pack_arguments((at, most)), 2)
+    call_blocks(code, "meet", pack_arguments((0, at, most)), 2)
 
 
 def met(most: int) -> list[int]:
     """For each of two blocks whether the other had begun before it ended: one thread does them one
     after another."""
     cells = np.zeros(4, np.int64)
-    run_meeting(Code(meet=(meet, (cells.ctypes.data, most))), cells.ctypes.data, most)
+    run_meeting(Code(meet=(meet, (0, cells.ctypes.data, most))), cells.ctypes.data, most)
     return cells[2:].tolist()

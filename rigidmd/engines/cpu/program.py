@@ -80,16 +80,22 @@ def profile_of(engine: CpuEngine, state: State, scheme: Scheme, dt: float) -> Pr
             sums[k] += 1e-9 * (np.array([spent.sum() for _, spent in rows]) - before)
     finally:
         engine.threads = asked
-    steps, sums = steps / (ROUNDS * MEASURED), sums / (ROUNDS * MEASURED)
-    is_single = np.array([one.blocks == 1 and one.job == ALONE for one, _ in rows])
+    measured = ROUNDS * MEASURED
+    return profile_from([one for one, _ in rows], numbers, steps / measured, sums / measured)
+
+
+def profile_from(
+    rows: list[Pass], numbers: tuple[int, ...], steps: np.ndarray, sums: np.ndarray
+) -> Profile:
+    """The profile of rows from times of a step (numbers of threads,) and of all blocks of each row
+    (numbers of threads, rows), s."""
+    is_single = np.array([one.blocks == 1 and one.job == ALONE for one in rows])
     times = np.where(is_single, sums, sums / np.array(numbers)[:, None])
     # a single block may call blocks of others on all threads, as when a list is built
     most, alone = numbers[-1] * sums[-1], np.maximum(sums[0], sums[-1])
     work = np.where(is_single, np.minimum(alone, most), sums[-1])
     lines = [
-        (one.text, tuple(of))
-        for (one, _), of in zip(rows, times.T.tolist(), strict=True)
-        if any(of)
+        (one.text, tuple(of)) for one, of in zip(rows, times.T.tolist(), strict=True) if any(of)
     ]
     rest = tuple((steps - times.sum(axis=1)).tolist())
     idle = max(0.0, 1 - float(work.sum()) / (numbers[-1] * float(steps[-1])))

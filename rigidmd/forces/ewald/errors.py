@@ -23,8 +23,8 @@ MAX_ALPHA_CUTOFF = 8.0  # of alpha times the cutoff: erfc is 1e-29 there
 #: they are good to 5 %.
 MAX_PROXY_POINTS, SEARCH_PROXY_POINTS = 32, 16
 #: Shortest real-space cutoff that is tried; time of a pair within a cutoff and a margin, on the
-#: scale of the costs of grids. Measured in mixed precision with 12288 sites: 1.0 with AVX-512, 1.7
-#: with AVX2 and cutoffs of 5.5 to 7.5 Å. The choice does not depend on the machine.
+#: scale of the costs of grids. Measured in mixed precision with 12288 sites: 1.7 with AVX2 and
+#: cutoffs of 5.5 to 7.5 Å, 1.0 on an earlier machine. The choice does not depend on the machine.
 SHORTEST_CUTOFF, LIST_MARGIN, PAIR_NS = 5.0, 1.0, 1.3
 ORDERS = (4, 5, 6, 7, 8)
 COARSE_SPACING = 3.0  # Å, for a liquid

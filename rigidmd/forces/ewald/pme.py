@@ -83,7 +83,9 @@ class PmeMesh(NamedTuple):
     around."""
 
     points: np.ndarray  # (3,) number along a, b, c
-    strides: np.ndarray  # (2,) of planes and rows in `flat`
+    # (2,) of planes and rows in `flat`. As products of the shape they would cost a multiplication
+    # for each row
+    strides: np.ndarray
     bounds: np.ndarray  # (3, blocks + 1) of planes, rows of Fourier components and sites
     cell: np.ndarray  # (3, 3)
     reciprocal: np.ndarray  # (3, 3) rows 2 pi times the reciprocal edges, 1/Å

@@ -63,7 +63,7 @@ def list_passes(
     pairs: PairList, code: Code | None, sites: BodySites | CentralSites, into: Evaluation
 ) -> TermPasses:
     """The passes that move the clusters with the cell and the molecules, and build the list if it
-    is not valid."""
+    is not valid. Before the first build nothing reads the positions, which all have one slot."""
     blocks, of_state = len(pairs.needed), (pairs, sites, into.state)
     moved = code, pairs, into.state, into.status
     build = code, *of_state, into.status
